@@ -281,6 +281,11 @@ impl Server {
         self.foreign = Foreign::new(bbmd, now);
     }
 
+    /// The BBMD at which the server registers.
+    pub fn bbmd(&self) -> Option<SocketAddrV4> {
+        self.options.bbmd
+    }
+
     /// The result of the registration at the BBMD.
     pub fn registration(&self) -> Registration {
         self.foreign.state

@@ -2,8 +2,9 @@
 //!
 //! The protocol is in `drivegate_bacnet`, which does no I/O. `objects` lists the objects of a drive, `view` reads
 //! their values from the process image, `writes` converts writes of clients to commands, `desk` combines them,
-//! `task` sends and receives datagrams, `loopback` does the same without sockets.
+//! `task` sends and receives datagrams, `bbmd` looks up the BBMD for it, `loopback` does the same without sockets.
 
+mod bbmd;
 mod desk;
 pub mod ede;
 mod kept;

@@ -1,8 +1,8 @@
-//! Moves datagrams between the sockets and the desk, and waits for drives; saves state for a restart, finds the BBMD.
+//! Moves datagrams between the sockets and the desk, and waits for drives; saves state for a restart, has the BBMD looked up.
 
 use std::collections::{BTreeSet, HashMap};
 use std::future::Future;
-use std::net::{SocketAddr, SocketAddrV4};
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -11,14 +11,14 @@ use std::task::Poll;
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_bacnet::To;
+use futures_util::StreamExt as _;
 use futures_util::stream::FuturesUnordered;
-use futures_util::{FutureExt as _, StreamExt as _};
 use tokio::net::UdpSocket;
 use tokio::sync::{Notify, mpsc, oneshot};
-use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
+use super::bbmd::{self, Lookups};
 use super::desk::{Desk, Ended};
 use super::kept::{self, KeptFile, KeptSlots};
 use super::rights::HostRights;
@@ -42,8 +42,6 @@ const TICK: Duration = Duration::from_millis(100);
 const LOOK: Duration = Duration::from_millis(5);
 /// Datagrams that are taken up before anything else is.
 const BATCH: usize = 64;
-/// Time between two look-ups of a BBMD whose name was not found.
-const RESOLVE: Duration = Duration::from_secs(30);
 /// Longest wait for requests in progress at the end.
 const LAST_ANSWERS: Duration = Duration::from_millis(1500);
 
@@ -81,9 +79,7 @@ pub(super) struct Task {
     reading: Option<(PathBuf, SlotsRead)>,
     /// Drives with a slot from before the restart against which the motor may run.
     protected: BTreeSet<Machine>,
-    resolved: Option<Instant>,
-    /// Task that looks up the BBMD.
-    lookup: Option<JoinHandle<Option<SocketAddrV4>>>,
+    lookups: Lookups,
     retired: bool,
 }
 
@@ -112,8 +108,7 @@ impl Task {
             kept: KeptFile::new(KeptSlots::WORDS),
             reading: None,
             protected: BTreeSet::new(),
-            resolved: None,
-            lookup: None,
+            lookups: Lookups::default(),
             retired: false,
         }
     }
@@ -232,7 +227,6 @@ impl Task {
                 .map(|(host, port)| (format!("{host}:{port}"), self.desk.server.registration())),
         }));
         self.find_bbmd(now);
-        self.take_bbmd(now);
         self.take_up_kept();
         if self.reading.is_none() {
             let path = self.keep_file();
@@ -367,45 +361,24 @@ impl Task {
                 }
                 if !same_bbmd {
                     self.desk.server.set_bbmd(None, now);
-                    (self.resolved, self.lookup) = (None, None);
+                    self.lookups = Lookups::default();
                 }
             }
         }
     }
 
-    /// Looks up the address of the BBMD, and repeats this until its name is found.
+    /// Looks up the address of the BBMD until one answers there.
     fn find_bbmd(&mut self, now: Instant) {
-        use drivegate_bacnet::Registration;
         let Some((host, port)) = self.options.bbmd.clone() else {
             return;
         };
-        let due = self
-            .resolved
-            .is_none_or(|at| now.saturating_duration_since(at) >= RESOLVE);
-        if self.desk.server.registration() != Registration::None || !due {
-            return;
-        }
-        self.resolved = Some(now);
-        self.lookup = Some(tokio::spawn(async move {
-            let mut found = tokio::net::lookup_host((host.as_str(), port)).await.ok()?;
-            found.find_map(|address| match address {
-                SocketAddr::V4(address) => Some(address),
-                SocketAddr::V6(_) => None,
-            })
-        }));
-    }
-
-    /// The BBMD was found, or not.
-    fn take_bbmd(&mut self, now: Instant) {
-        let Some(lookup) = self.lookup.take_if(|lookup| lookup.is_finished()) else {
-            return;
-        };
-        let Some((host, port)) = self.options.bbmd.clone() else {
-            return;
-        };
-        match lookup.now_or_never() {
-            Some(Ok(Some(address))) => self.desk.server.set_bbmd(Some(address), now),
-            _ => tracing::warn!(
+        let server = &mut self.desk.server;
+        let look_up = || tokio::spawn(bbmd::look_up(host.clone(), port));
+        self.lookups.begin(server.registration(), now, look_up);
+        match self.lookups.ended() {
+            Some(Some(address)) if server.bbmd() != Some(address) => server.set_bbmd(Some(address), now),
+            Some(Some(_)) | None => {}
+            Some(None) => tracing::warn!(
                 target: "drivegate::bacnet", "cannot find the BBMD {host}:{port}; retrying every 30 s; check `bbmd` \
                                               of [bacnet]"
             ),
