@@ -137,7 +137,7 @@ impl Server {
 
     /// Sends the notifications that are due.
     pub(super) fn notify(&mut self, app: &dyn Application, now: Instant) {
-        while let Some((instance, key, confirmed)) = self.cov.next() {
+        while let Some((instance, key, confirmed)) = self.cov.next(|device| self.quiet.contains_key(&device)) {
             let device = self.device(instance).filter(|_| app.answers(instance));
             let shows = device.and_then(|device| Some((self.shows(&device, &key, app, now)?, device)));
             let Some(((told, _, values), device)) = shows else {

@@ -152,3 +152,28 @@ fn clocks_and_what_does_not_fit_are_not_subscribed_to() {
     );
     assert_eq!(answers.len(), 2);
 }
+
+#[test]
+fn a_device_that_must_be_quiet_notifies_afterwards() {
+    let mut rig = ServerWithClients::new();
+    rig.shows(101, 0, Datum::Number(10.0));
+    let answers = rig.ask(5, Some(1), 1, c::SUBSCRIBE_COV, &subscribe(SPEED, true, 600));
+    let invoke = answers[1][2];
+    // A second change waits until the first notification is acknowledged.
+    assert!(rig.change(20.0).is_empty());
+    let quiet = written(|w| {
+        w.context_unsigned(0, 1).context_unsigned(1, 2);
+        w.context_octets(2, &[&[0], "secret".as_bytes()].concat());
+    });
+    assert_eq!(
+        rig.ask(5, Some(1), 2, c::DEVICE_COMMUNICATION_CONTROL, &quiet),
+        [apdu::simple_ack(2, c::DEVICE_COMMUNICATION_CONTROL)]
+    );
+    rig.tell(5, Some(1), &apdu::simple_ack(invoke, c::COV_NOTIFICATION));
+    assert!(rig.change(30.0).is_empty() && rig.out().is_empty());
+    rig.later(Duration::from_secs(59));
+    assert!(rig.out().is_empty());
+    rig.later(Duration::from_secs(2));
+    let out: Vec<Vec<u8>> = rig.out().into_iter().map(|(.., apdu)| apdu).collect();
+    assert_eq!(notified(&out), [Some(Data::Real(30.0))], "the newest value");
+}
