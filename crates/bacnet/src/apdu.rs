@@ -39,8 +39,6 @@ pub enum Apdu<'a> {
     ComplexAck(u8),
     /// Acknowledgement of received segments.
     SegmentAck {
-        /// A negative acknowledgement: segments arrived out of order.
-        negative: bool,
         /// Whether the sender acts as the server of the transaction.
         server: bool,
         /// The invoke id of the transaction whose segments are acknowledged.
@@ -107,7 +105,6 @@ pub fn decode(bytes: &[u8]) -> Option<Apdu<'_>> {
         (2, [invoke, _]) => Apdu::SimpleAck(*invoke),
         (3, [invoke, _, ..]) => Apdu::ComplexAck(*invoke),
         (4, [invoke, sequence, window]) => Apdu::SegmentAck {
-            negative: flag(1),
             server: flag(0),
             invoke: *invoke,
             sequence: *sequence,

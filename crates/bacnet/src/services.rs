@@ -48,11 +48,6 @@ pub struct PropertyRef {
 pub struct Range(pub Option<(u32, u32)>);
 
 impl Range {
-    /// Whether the range includes this instance.
-    pub fn covers(&self, instance: u32) -> bool {
-        self.0.is_none_or(|(low, high)| (low..=high).contains(&instance))
-    }
-
     fn read(reader: &mut Reader<'_>) -> Read<Range> {
         let Some(low) = reader.optional_u32(0)? else {
             return Ok(Range(None));
