@@ -17,6 +17,8 @@ const WAITING_IN_ALL: usize = 1024 * 1024;
 const BROADCASTS: u64 = 100;
 /// Maximum number of addresses that are tracked at a time.
 const ADDRESSES: usize = 1024;
+/// Datagrams that may wait for the system: more than a notification of every subscription.
+const READY: usize = 8192;
 /// Step in which a second of traffic is counted.
 const STEP: Duration = Duration::from_millis(100);
 const STEPS: usize = 11;
@@ -81,6 +83,21 @@ impl AddressRecord {
     }
 }
 
+/// Datagrams that may be sent.
+#[derive(Debug, Default)]
+struct Ready(VecDeque<(To, Vec<u8>)>);
+
+impl Ready {
+    /// Adds a datagram; returns how many were dropped for it, if the system accepts none any more.
+    fn put(&mut self, datagram: (To, Vec<u8>)) -> u64 {
+        if self.0.len() >= READY {
+            return 1;
+        }
+        self.0.push_back(datagram);
+        0
+    }
+}
+
 /// Octets that wait until they may be sent.
 #[derive(Debug)]
 pub(super) struct Traffic {
@@ -92,7 +109,7 @@ pub(super) struct Traffic {
     waiting: HashSet<Vec<u8>>,
     octets: usize,
     sent: Window,
-    ready: VecDeque<(To, Vec<u8>)>,
+    ready: Ready,
     /// Datagrams dropped for lack of room.
     pub(super) dropped: u64,
 }
@@ -107,7 +124,7 @@ impl Traffic {
             waiting: HashSet::new(),
             octets: 0,
             sent: Window::default(),
-            ready: VecDeque::new(),
+            ready: Ready::default(),
             dropped: 0,
         }
     }
@@ -162,7 +179,7 @@ impl Traffic {
         };
         if known.waiting.is_empty() && known.may(len, step) {
             known.left.add(step, u32::try_from(len).unwrap_or(u32::MAX));
-            self.ready.push_back((To::Host(to), bytes));
+            self.dropped += self.ready.put((To::Host(to), bytes));
         } else if known.octets + len <= WAITING && held + len <= WAITING_IN_ALL {
             known.octets += len;
             known.waiting.push_back((to, bytes));
@@ -174,7 +191,7 @@ impl Traffic {
 
     /// Sends data that the limits do not count: a notification, or a request of our own.
     pub(super) fn exempt(&mut self, to: SocketAddrV4, bytes: Vec<u8>) {
-        self.ready.push_back((To::Host(to), bytes));
+        self.dropped += self.ready.put((To::Host(to), bytes));
     }
 
     /// Sends a broadcast, at once or later. A broadcast that already waits is not added a second time.
@@ -182,7 +199,7 @@ impl Traffic {
         let step = self.step(now);
         if self.broadcasts.is_empty() && self.sent.sum(step) < BROADCASTS {
             self.sent.add(step, 1);
-            self.ready.push_back((To::Broadcast, bytes));
+            self.dropped += self.ready.put((To::Broadcast, bytes));
         } else if self.waiting.contains(&bytes) {
         } else if self.octets + bytes.len() <= WAITING {
             self.octets += bytes.len();
@@ -202,7 +219,7 @@ impl Traffic {
             self.sent.add(step, 1);
             self.octets -= bytes.len();
             self.waiting.remove(&bytes);
-            self.ready.push_back((To::Broadcast, bytes));
+            self.dropped += self.ready.put((To::Broadcast, bytes));
         }
         for known in self.known.values_mut() {
             while let Some((_, bytes)) = known.waiting.front()
@@ -213,14 +230,14 @@ impl Traffic {
                 known.left.add(step, u32::try_from(len).unwrap_or(u32::MAX));
                 known.octets -= len;
                 self.held -= len;
-                self.ready.push_back((To::Host(to), bytes));
+                self.dropped += self.ready.put((To::Host(to), bytes));
             }
         }
     }
 
     /// The next datagram to send.
     pub(super) fn next(&mut self) -> Option<(To, Vec<u8>)> {
-        self.ready.pop_front()
+        self.ready.0.pop_front()
     }
 }
 
@@ -297,6 +314,18 @@ mod tests {
             traffic.poll(start + Duration::from_millis(1200 * second));
         }
         assert_eq!(traffic.held, 0);
+    }
+
+    #[test]
+    fn what_the_system_does_not_take_is_bounded() {
+        let mut traffic = Traffic::new(Instant::now());
+        for n in 0..10_000_u16 {
+            traffic.exempt(host(1), n.to_be_bytes().to_vec());
+        }
+        assert_eq!(
+            (octets(&mut traffic), traffic.dropped),
+            (2 * READY, 10_000 - READY as u64)
+        );
     }
 
     #[test]

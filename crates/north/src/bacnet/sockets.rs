@@ -4,6 +4,7 @@
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 
+use drivegate_bacnet::To;
 use rustix::net::{AddressFamily, SocketFlags, SocketType, bind, socket_with, sockopt};
 use tokio::net::UdpSocket;
 
@@ -91,6 +92,50 @@ fn broadcast_of(address: Ipv4Addr, prefix: u8) -> Ipv4Addr {
     }
 }
 
+impl Sockets {
+    /// Sends a datagram, if the system accepts it now.
+    ///
+    /// # Errors
+    /// If the datagram was not sent.
+    pub(super) fn send(&self, to: To, datagram: &[u8]) -> io::Result<()> {
+        let to = match to {
+            To::Host(host) => host,
+            To::Broadcast => self.broadcast_to,
+        };
+        self.unicast.try_send_to(datagram, SocketAddr::V4(to)).map(|_| ())
+    }
+}
+
+/// A datagram that the system did not accept yet.
+#[derive(Debug, Default)]
+pub(super) struct Outbox(Option<(To, Vec<u8>)>);
+
+impl Outbox {
+    /// Sends what waits and what `next` gives. If the system accepts no more now, the rest waits for the next call; a datagram
+    /// that cannot be sent at all is dropped, as UDP allows.
+    pub(super) fn flush(
+        &mut self,
+        mut next: impl FnMut() -> Option<(To, Vec<u8>)>,
+        mut send: impl FnMut(To, &[u8]) -> io::Result<()>,
+    ) {
+        while let Some((to, datagram)) = self.0.take().or_else(&mut next) {
+            match send(to, &datagram) {
+                Ok(()) => {}
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                    self.0 = Some((to, datagram));
+                    return;
+                }
+                Err(error) => tracing::debug!(target: "drivegate::bacnet", "cannot send to {to:?}: {error}"),
+            }
+        }
+    }
+
+    /// Whether a datagram waits for the system.
+    pub(super) fn is_waiting(&self) -> bool {
+        self.0.is_some()
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -142,5 +187,32 @@ mod tests {
         let port = sockets.address.port();
         let widest = SocketAddr::from((Ipv4Addr::BROADCAST, port));
         assert_eq!(bound, [SocketAddr::V4(sockets.broadcast_to), widest]);
+    }
+
+    #[test]
+    fn what_the_system_does_not_accept_yet_is_sent_later_in_its_order() {
+        let datagrams = |numbers: std::ops::Range<u8>| numbers.map(|n| (To::Broadcast, vec![n]));
+        let (mut outbox, mut pending) = (Outbox::default(), datagrams(0..6));
+        let mut sent: Vec<u8> = Vec::new();
+        // The system accepts two datagrams at a time; number 3 it never accepts.
+        let mut flush = |outbox: &mut Outbox| {
+            let mut room = 2;
+            outbox.flush(
+                || pending.next(),
+                |_, datagram| match (datagram, room) {
+                    ([3], _) => Err(io::ErrorKind::NetworkUnreachable.into()),
+                    (_, 0) => Err(io::ErrorKind::WouldBlock.into()),
+                    (datagram, _) => {
+                        room -= 1;
+                        sent.extend(datagram);
+                        Ok(())
+                    }
+                },
+            );
+            (outbox.is_waiting(), sent.clone())
+        };
+        assert_eq!(flush(&mut outbox), (true, vec![0, 1]));
+        assert_eq!(flush(&mut outbox), (true, vec![0, 1, 2, 4]));
+        assert_eq!(flush(&mut outbox), (false, vec![0, 1, 2, 4, 5]));
     }
 }

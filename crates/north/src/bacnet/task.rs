@@ -10,7 +10,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::Poll;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate_bacnet::To;
 use futures_util::StreamExt as _;
 use futures_util::stream::FuturesUnordered;
 use tokio::net::UdpSocket;
@@ -22,7 +21,7 @@ use super::bbmd::{self, Lookups};
 use super::desk::{Desk, Ended};
 use super::kept::{self, KeptFile, KeptSlots};
 use super::rights::HostRights;
-use super::sockets::Sockets;
+use super::sockets::{Outbox, Sockets};
 use super::writes::Waiting;
 use super::{NorthState, Options};
 use crate::reading::{Reader, is_readable};
@@ -63,6 +62,7 @@ type SlotsRead = oneshot::Receiver<KeptSlots>;
 pub(super) struct Task {
     options: Arc<Options>,
     sockets: Sockets,
+    outbox: Outbox,
     /// Readers of the sockets: for this host, and for all.
     readers: [Reader; 3],
     stats: Arc<NorthState>,
@@ -97,6 +97,7 @@ impl Task {
         Task {
             options,
             sockets,
+            outbox: Outbox::default(),
             readers: [waiting_reader(), waiting_reader(), waiting_reader()],
             stats,
             busy,
@@ -124,7 +125,7 @@ impl Task {
         loop {
             self.flush();
             let subscribed = self.stats.bacnet.get().is_some_and(|f| f.counters.subscriptions > 0);
-            let waits = !self.writes.is_empty();
+            let (waits, unsent) = (!self.writes.is_empty(), self.outbox.is_waiting());
             tokio::select! {
                 () = cancel.cancelled() => break,
                 order = orders.recv() => match order {
@@ -137,6 +138,8 @@ impl Task {
                         self.take(&mut buffer, None);
                     }
                 }
+                // The next turn goes on sending.
+                _ = self.sockets.unicast.writable(), if unsent => {}
                 place = broadcast_received(&self.sockets.broadcasts), if !self.retired => self.take(&mut buffer, Some(place)),
                 Some(ended) = self.writes.next(), if waits => self.desk.ended(&ended, Instant::now()),
                 () = self.news.notified(), if subscribed && !due => due = true,
@@ -193,17 +196,11 @@ impl Task {
         }
     }
 
-    /// Sends pending datagrams. Any that the system does not accept at once are dropped, as UDP allows.
+    /// Sends pending datagrams, as many as the system accepts now.
     fn flush(&mut self) {
-        while let Some((to, datagram)) = self.desk.server.transmit() {
-            let to = match to {
-                To::Host(host) => host,
-                To::Broadcast => self.sockets.broadcast_to,
-            };
-            if let Err(error) = self.sockets.unicast.try_send_to(&datagram, SocketAddr::V4(to)) {
-                tracing::debug!(target: "drivegate::bacnet", "cannot send to {to}: {error}");
-            }
-        }
+        let (server, sockets) = (&mut self.desk.server, &self.sockets);
+        self.outbox
+            .flush(|| server.transmit(), |to, datagram| sockets.send(to, datagram));
     }
 
     /// Passes writes to the drives.
