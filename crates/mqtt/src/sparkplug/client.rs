@@ -249,6 +249,8 @@ impl NodeClient {
     }
 
     fn on_device_command(&mut self, device: &str, message: &Incoming) {
+        // Between two checks, and until a client that ends with a reload is gone, the plant may already be a newer one.
+        session::follow_plant(self);
         let mut drives = self.drives.iter().map(|drive| &drive.metrics).enumerate();
         let target = drives.find(|(_, metrics)| metrics.drive.image.spec.name == device);
         let now = Instant::now();
@@ -502,3 +504,6 @@ impl session::Client for NodeClient {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
