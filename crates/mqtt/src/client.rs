@@ -191,11 +191,6 @@ impl PlainClient {
         client
     }
 
-    /// Whether another message from the broker may be accepted: there is room for its result.
-    fn receives(&self) -> bool {
-        self.commands.has_room() && self.outbox.has_room_for_results()
-    }
-
     /// Notes that a message left the outbox.
     fn settled(&mut self, settled: Option<Settled>) {
         let Some(Settled { topic, kind }) = settled else { return };
@@ -309,9 +304,8 @@ impl session::Client for PlainClient {
     }
 
     async fn next(&mut self) -> Step {
-        let receives = self.receives();
         tokio::select! {
-            step = self.common.link.next(), if receives => return step,
+            step = self.common.link.next() => return step,
             event = self.events.recv() => self.on_event(event),
             ended = self.commands.finished() => self.on_ended(ended),
             loaded = self.store.next() => self.on_loaded(MqttKind::Event, loaded),

@@ -23,7 +23,7 @@ use drivegate_north::command_json::{
 };
 
 /// Limits of the commands that wait for the bus. Only stops can reach them: the queues of the buses accept fewer other
-/// commands.
+/// commands. A stop beyond them is executed, but its result is not published.
 const WAITING: QueueLimit = QueueLimit {
     most: 4096,
     bytes: 8 << 20,
@@ -47,6 +47,8 @@ pub(super) struct Commands {
     memory: SharedMemory,
     stop_all: Arc<StopAll>,
     rules: Rules,
+    /// Number of stops whose results are not awaited, since the last [`Commands::take_unfollowed`].
+    unfollowed: u64,
 }
 
 /// The configuration of commands.
@@ -117,6 +119,7 @@ impl Commands {
             memory,
             stop_all,
             rules,
+            unfollowed: 0,
         }
     }
 
@@ -130,10 +133,9 @@ impl Commands {
         }
     }
 
-    /// Whether another message may be processed. Otherwise messages stay with the broker, so that no stop is
-    /// refused for lack of room.
-    pub(super) fn has_room(&self) -> bool {
-        !self.waiting.is_full(WAITING)
+    /// The number of stops since the last call that have no result because too many commands waited.
+    pub(super) fn take_unfollowed(&mut self) -> u64 {
+        std::mem::take(&mut self.unfollowed)
     }
 
     /// Processes a message at `now`, which is `time` on the calendar. Returns its result if it is known at once;
@@ -303,6 +305,10 @@ impl Commands {
     fn follow(&mut self, mut pending: PendingCommand, time: SystemTime) -> Option<Message> {
         match pending.placed.answer().filter(|answer| !answer.outcome.is_ok()) {
             Some(answer) => Some(self.result(pending, &answer, Shown::default(), time)),
+            None if self.waiting.is_full(WAITING) => {
+                self.unfollowed += 1;
+                None
+            }
             None => {
                 self.waiting.push(pending);
                 None

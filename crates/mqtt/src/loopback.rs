@@ -1,6 +1,5 @@
 //! The set topics without a broker and a runtime, for tests and virtual time.
 
-use std::collections::VecDeque;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::commands::{Commands, Rules};
@@ -39,8 +38,6 @@ impl From<Message> for Published {
 pub struct Loopback {
     plant: SharedPlant,
     commands: Commands,
-    /// Messages that stay with the broker because there is no room for further commands.
-    held: VecDeque<Incoming>,
     results: Vec<Published>,
     begun: (Instant, SystemTime),
     /// The connection over which messages arrive.
@@ -65,20 +62,19 @@ impl Loopback {
                 std::sync::Arc::default(),
                 None,
             ),
-            held: VecDeque::new(),
             results: Vec::new(),
             begun: (now, time),
             connection: Connection::opened(now),
         }
     }
 
-    /// Receives a message. Its command is in the queue of its bus when this returns, unless so many wait that the
-    /// broker keeps the message until a later [`Loopback::poll`].
+    /// Receives a message. Its command is in the queue of its bus when this returns.
     pub fn receive(&mut self, mut message: Incoming, now: Instant) {
         let connection = self.connection.clone();
         message.arrival.get_or_insert_with(|| Arrival::over(connection, now));
-        self.held.push_back(message);
-        self.work(now);
+        let (plant, time) = (self.plant.load(), self.time(now));
+        let result = self.commands.take(message, &plant, |_| false, now, time);
+        self.results.extend(result.map(Published::from));
     }
 
     /// The results since the last call, in order.
@@ -87,24 +83,13 @@ impl Loopback {
         while let Some(ended) = self.commands.try_finished() {
             let result = self.commands.answer(ended, time);
             self.results.push(result.into());
-            self.work(now);
         }
         std::mem::take(&mut self.results)
     }
 
-    /// Whether any command waits for its answer, for its confirmation or for room.
+    /// Whether any command waits for its answer or for its confirmation.
     pub fn is_waiting(&self) -> bool {
-        !self.commands.is_idle() || !self.held.is_empty()
-    }
-
-    fn work(&mut self, now: Instant) {
-        let (plant, time) = (self.plant.load(), self.time(now));
-        while self.commands.has_room()
-            && let Some(message) = self.held.pop_front()
-        {
-            let result = self.commands.take(message, &plant, |_| false, now, time);
-            self.results.extend(result.map(Published::from));
-        }
+        !self.commands.is_idle()
     }
 
     fn time(&self, now: Instant) -> SystemTime {

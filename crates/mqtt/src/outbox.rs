@@ -13,7 +13,7 @@ use super::Qos;
 use super::number::{MessageNumber, Place};
 use drivegate_north::MqttKind;
 
-/// Maximum number of waiting results, and their size in bytes; beyond it, no commands are accepted.
+/// Maximum number of waiting results, and their size in bytes.
 const RESULTS: usize = 16_384;
 const RESULT_BYTES: usize = 32 << 20;
 /// Maximum number of results that wait on one topic; beyond it, commands that would be answered there are refused.
@@ -193,7 +193,8 @@ impl Outbox {
         self.has_leader = true;
     }
 
-    /// Adds a result of a command.
+    /// Adds a result of a command; if too many wait, the oldest is dropped. Receiving continues, because the
+    /// acknowledgements that make room arrive over the same connection, and so do stops.
     pub(super) fn push_result(&mut self, message: Message) {
         *self.results_of.entry(message.topic.clone()).or_default() += 1;
         self.push(MqttKind::Result, message, None);
@@ -213,13 +214,14 @@ impl Outbox {
             },
             _ => message,
         };
-        let queue = self.queue_mut(kind);
-        while kind != MqttKind::Result && queue.is_full_for(&message) {
-            // Entries in flight are dropped last, because the broker has probably received them.
-            let victim = queue.entries.iter().position(|e| !e.in_flight).unwrap_or(0);
-            queue.remove(victim);
-            queue.lost += 1;
+        let most = match kind {
+            MqttKind::Result => (RESULTS, RESULT_BYTES),
+            MqttKind::Event | MqttKind::History => (KEPT, KEPT_BYTES),
+        };
+        while self.queue(kind).is_full_for(&message, most) {
+            self.drop_oldest(kind);
         }
+        let queue = self.queue_mut(kind);
         queue.bytes += message.bytes();
         queue.last = queue.last.next(number);
         queue.entries.push_back(Entry {
@@ -228,6 +230,18 @@ impl Outbox {
             in_flight: false,
             attempts: 0,
         });
+    }
+
+    /// Drops the oldest message of a queue.
+    fn drop_oldest(&mut self, kind: MqttKind) {
+        let queue = self.queue_mut(kind);
+        // Entries in flight are dropped last, because the broker has probably received them.
+        let victim = queue.entries.iter().position(|e| !e.in_flight).unwrap_or(0);
+        let dropped = queue.remove(victim);
+        queue.lost += 1;
+        if let Some(result) = dropped.filter(|_| kind == MqttKind::Result) {
+            self.forget_result(&result.message.topic);
+        }
     }
 
     /// Drops the waiting messages up to this one: they are no longer on disk because the buffer was full, and count
@@ -257,11 +271,6 @@ impl Outbox {
             MqttKind::Event => &mut self.events,
             MqttKind::History => &mut self.history,
         }
-    }
-
-    /// Whether another command may be received because there is room for its result.
-    pub(super) fn has_room_for_results(&self) -> bool {
-        self.results.entries.len() < RESULTS && self.results.bytes < RESULT_BYTES
     }
 
     /// Whether so many results wait on a topic that further commands answered there are refused.
@@ -535,8 +544,8 @@ impl Outbox {
 }
 
 impl Queue {
-    fn is_full_for(&self, message: &Message) -> bool {
-        self.entries.len() >= KEPT || !self.entries.is_empty() && self.bytes + message.bytes() > KEPT_BYTES
+    fn is_full_for(&self, message: &Message, (most, bytes): (usize, usize)) -> bool {
+        self.entries.len() >= most || !self.entries.is_empty() && self.bytes + message.bytes() > bytes
     }
 
     fn next(&self, kind: MqttKind, free: bool) -> Option<(Key, Message)> {

@@ -8,6 +8,7 @@ mod delivery;
 mod failover;
 mod home_assistant;
 mod hostile;
+mod puppet;
 mod sparkplug;
 mod telemetry;
 mod tls;

@@ -146,7 +146,8 @@ impl PlainClient {
 
     /// Counts the messages that the outbox lost, and logs their number once a minute.
     pub(super) fn count_lost(&mut self, now: Instant) {
-        for (kind, count) in self.outbox.take_lost() {
+        let unfollowed = (MqttKind::Result, self.commands.take_unfollowed());
+        for (kind, count) in self.outbox.take_lost().into_iter().chain([unfollowed]) {
             self.common.stats.mqtt.lost(kind, count);
         }
         let total: u64 = self.common.stats.mqtt.losses().map(|(_, count)| count).sum();

@@ -148,27 +148,35 @@ fn queues_are_bounded_and_drop_the_oldest() {
 }
 
 #[test]
-fn results_are_never_dropped_but_no_more_commands_are_received() {
+fn results_beyond_the_bound_push_out_the_oldest_that_are_not_in_flight() {
     let mut outbox = outbox();
-    for i in 0..RESULTS {
-        assert!(outbox.has_room_for_results());
-        assert_eq!(outbox.is_crowded("r"), i >= RESULTS_OF_TOPIC);
+    for n in 0..RESULTS {
+        assert_eq!(outbox.is_crowded("r"), n >= RESULTS_OF_TOPIC);
         outbox.push_result(event("r"));
     }
-    assert!(!outbox.has_room_for_results() && !outbox.is_crowded("other"));
-    assert_eq!(drain(&mut outbox, usize::MAX).len(), RESULTS);
-    (1..=1000).for_each(|packet| outbox.numbered(packet).unwrap());
-    (1..=1000).for_each(|packet| assert!(outbox.acked(packet).is_some()));
-    assert!(outbox.has_room_for_results());
+    assert_eq!((outbox.waiting(), lost(&mut outbox, MqttKind::Result)), (RESULTS, 0));
+    assert!(outbox.is_crowded("r") && !outbox.is_crowded("other"));
+    assert_eq!(names(&drain(&mut outbox, 2)), ["r", "r"]);
+    (0..RESULTS - 2).for_each(|_| outbox.push_result(event("other")));
+    assert_eq!(
+        (outbox.waiting(), lost(&mut outbox, MqttKind::Result)),
+        (RESULTS, RESULTS as u64 - 2)
+    );
+    assert!(!outbox.is_crowded("r") && outbox.is_crowded("other"));
+    for packet in [1, 2] {
+        outbox.numbered(packet).unwrap();
+        assert_eq!(outbox.acked(packet).map(|settled| settled.topic), Some(topic("r")));
+    }
+    assert_eq!(drain(&mut outbox, usize::MAX).len(), RESULTS - 2);
+
     let mut outbox = self::outbox();
     let long = Message {
         correlation: Some(vec![0; 60_000]),
         ..event("r")
     };
-    while outbox.has_room_for_results() {
-        outbox.push_result(long.clone());
-    }
-    assert_eq!(outbox.waiting(), RESULT_BYTES / 60_001 + 1);
+    let most = RESULT_BYTES / 60_001;
+    (0..most + 5).for_each(|_| outbox.push_result(long.clone()));
+    assert_eq!((outbox.waiting(), lost(&mut outbox, MqttKind::Result)), (most, 5));
 }
 
 #[test]

@@ -1,0 +1,176 @@
+//! A broker whose packets the test sends itself, byte by byte, and whose acknowledgements it withholds.
+
+use std::io::Write as _;
+use std::net::{TcpListener, TcpStream};
+use std::sync::{Arc, Mutex};
+
+use drivegate_model::drive::Value;
+use drivegate_testkit::mqtt as packets;
+
+use super::bench::*;
+
+const SET: &str = "drivegate/hall/drive/p1/set";
+/// Receive maximum of the broker: one message at a time.
+const ONE: [u8; 3] = [0x21, 0, 1];
+
+#[derive(Default)]
+struct Seen {
+    connections: usize,
+    /// Payloads of the messages, in order.
+    messages: Vec<String>,
+    withheld: Vec<[u8; 2]>,
+    /// Whether the broker acknowledges messages.
+    acknowledges: bool,
+}
+
+#[derive(Clone)]
+struct Puppet {
+    port: u16,
+    seen: Arc<Mutex<Seen>>,
+    /// Locked for whole packets, since two threads write.
+    stream: Arc<Mutex<Option<TcpStream>>>,
+}
+
+/// A PUBLISH with QoS 0; with correlation data also with a response topic.
+fn publish(topic: &str, correlation: &[u8], payload: &str) -> Vec<u8> {
+    let short = |length: usize| u16::try_from(length).unwrap().to_be_bytes();
+    let varint = |mut length: usize| {
+        let mut bytes = Vec::new();
+        loop {
+            let more = length > 0x7F;
+            bytes.push((length & 0x7F) as u8 | u8::from(more) << 7);
+            length >>= 7;
+            if !more {
+                return bytes;
+            }
+        }
+    };
+    let properties = match correlation.len() {
+        0 => Vec::new(),
+        length => [b"\x08\0\x07answers\x09", &short(length)[..], correlation].concat(),
+    };
+    let body = [
+        &short(topic.len()),
+        topic.as_bytes(),
+        &varint(properties.len()),
+        &properties,
+        payload.as_bytes(),
+    ]
+    .concat();
+    [&[0x30][..], &varint(body.len()), &body].concat()
+}
+
+impl Puppet {
+    fn start() -> Puppet {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let puppet = Puppet {
+            port,
+            seen: Arc::default(),
+            stream: Arc::default(),
+        };
+        let shared = puppet.clone();
+        // The thread lives as long as the process.
+        std::thread::spawn(move || {
+            for stream in listener.incoming().map_while(Result::ok) {
+                stream.set_nodelay(true).unwrap();
+                stream.set_write_timeout(Some(DEADLINE)).unwrap();
+                shared.seen.lock().unwrap().connections += 1;
+                *shared.stream.lock().unwrap() = Some(stream.try_clone().unwrap());
+                shared.serve(stream);
+            }
+        });
+        puppet
+    }
+
+    fn serve(&self, mut stream: TcpStream) {
+        while let Some((kind, body)) = packets::read_packet(&mut stream) {
+            match kind >> 4 {
+                1 => self.send(&[&[0x20, 6, 0, 0, 3][..], &ONE].concat()),
+                8 => {
+                    let codes = vec![1; packets::filters(&body).len()];
+                    let answer = packets::subscribed(&body, &codes);
+                    self.send(&[&[0x90, u8::try_from(answer.len()).unwrap()][..], &answer].concat());
+                }
+                3 => self.message(kind, &body),
+                12 => self.send(&[0xD0, 0]),
+                _ => {}
+            }
+        }
+    }
+
+    fn message(&self, kind: u8, body: &[u8]) {
+        let mut seen = self.seen.lock().unwrap();
+        let text = String::from_utf8_lossy(body);
+        seen.messages.push(text.into_owned());
+        if kind & 0x06 == 0 {
+            return;
+        }
+        let behind = 2 + usize::from(u16::from_be_bytes([body[0], body[1]]));
+        seen.withheld.push([body[behind], body[behind + 1]]);
+        let due = if seen.acknowledges {
+            std::mem::take(&mut seen.withheld)
+        } else {
+            Vec::new()
+        };
+        drop(seen);
+        due.into_iter().for_each(|packet| self.acknowledge(packet));
+    }
+
+    fn acknowledge(&self, packet: [u8; 2]) {
+        self.send(&[0x40, 4, packet[0], packet[1], 0, 0]);
+    }
+
+    /// Acknowledges the messages so far, and those to come if `acknowledges`.
+    fn acknowledge_all(&self, acknowledges: bool) {
+        let mut seen = self.seen.lock().unwrap();
+        seen.acknowledges = acknowledges;
+        let due = std::mem::take(&mut seen.withheld);
+        drop(seen);
+        due.into_iter().for_each(|packet| self.acknowledge(packet));
+    }
+
+    fn send(&self, bytes: &[u8]) {
+        // The gateway may have closed the connection.
+        let _ = self.stream.lock().unwrap().as_ref().unwrap().write_all(bytes);
+    }
+
+    /// Waits for a message with this text; returns it.
+    fn wait(&self, text: &str) -> String {
+        wait_for(text, || {
+            let seen = self.seen.lock().unwrap();
+            seen.messages.iter().find(|message| message.contains(text)).cloned()
+        })
+    }
+
+    fn connections(&self) -> usize {
+        self.seen.lock().unwrap().connections
+    }
+}
+
+fn stops(gateway: &Gateway) -> usize {
+    let stop = [("run".to_string(), Value::Bool(false))];
+    gateway.ordered().iter().filter(|order| order.1 == stop).count()
+}
+
+#[test]
+fn more_results_than_there_is_room_for_cost_results_and_no_connection() {
+    let puppet = Puppet::start();
+    let gateway = Gateway::start(options(puppet.port), plant(&["p1"]));
+    puppet.wait("/status");
+    puppet.acknowledge_all(false);
+    // Each result repeats the correlation data: together more than 32 MiB.
+    let refused = publish(&format!("{SET}/nothing"), &[b'c'; 60_000], "1");
+    (0..700).for_each(|_| puppet.send(&refused));
+    puppet.send(&publish(&format!("{SET}/run"), &[], "false"));
+    wait_for("the stop", || (stops(&gateway) == 1).then_some(()));
+    let lost = || gateway.stats.mqtt.losses().map(|(_, count)| count).sum::<u64>();
+    wait_for("the count of lost results", || (lost() > 100).then_some(()));
+    puppet.acknowledge_all(true);
+    puppet.wait("\"result\":\"acknowledged\"");
+    puppet.send(&publish(&format!("{SET}/run"), &[], "false"));
+    wait_for("another stop", || (stops(&gateway) == 2).then_some(()));
+    assert!(gateway.connected());
+    assert_eq!(puppet.connections(), 1);
+    gateway.stop();
+}
