@@ -7,6 +7,7 @@
 mod aliases;
 mod backlog;
 mod filters;
+mod frames;
 mod options;
 mod polling;
 
@@ -28,6 +29,7 @@ use self::aliases::Aliases;
 use self::backlog::Backlog;
 use self::filters::{SUBSCRIBE_BYTES, packets};
 pub(super) use self::filters::{commanding, of_others};
+use self::frames::{Carrier, PacketFrames};
 use self::options::mqtt_options;
 use self::polling::poll;
 use super::broker_limits::{BrokerLimits, Lack};
@@ -136,9 +138,15 @@ impl Connection {
         };
         let reader = Arc::new(Reader::here());
         let of_stream = reader.clone();
+        let carrier = Carrier {
+            proxy: options.proxy.is_some(),
+            tls: options.tls,
+            web_socket: broker.path.is_some(),
+        };
         mqtt.set_socket_connector(move |_, network| {
             let (connecting, reader) = (dial.clone().connect(dialled.clone(), first, network), of_stream.clone());
-            async move { Ok(Dated::new(connecting.await?, reader)) }
+            let frames = Box::new(PacketFrames::new(carrier));
+            async move { Ok(Dated::in_frames(connecting.await?, reader, frames)) }
         });
         let (client, eventloop) = AsyncClient::builder(mqtt).capacity(REQUESTS).build();
         let (sender, event) = mpsc::channel(EVENTS);

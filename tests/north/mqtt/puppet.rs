@@ -3,7 +3,10 @@
 use std::io::Write as _;
 use std::net::{TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
+use std::time::Instant;
 
+use drivegate_core::order::{Authority, Order, Origin, SourceKind};
+use drivegate_core::plant::OrderRequest;
 use drivegate_model::drive::Value;
 use drivegate_testkit::mqtt as packets;
 
@@ -172,5 +175,33 @@ fn more_results_than_there_is_room_for_cost_results_and_no_connection() {
     wait_for("another stop", || (stops(&gateway) == 2).then_some(()));
     assert!(gateway.connected());
     assert_eq!(puppet.connections(), 1);
+    gateway.stop();
+}
+
+/// A stop over another way in is acknowledged between the two parts of a start.
+#[test]
+fn a_packet_in_two_parts_is_as_old_as_the_first() {
+    let puppet = Puppet::start();
+    let gateway = Gateway::start(options(puppet.port), plant(&["p1"]));
+    puppet.wait("/status");
+    puppet.acknowledge_all(false);
+    let first = publish(SET, &[], r#"{"id": "first", "speed_reference": 10}"#);
+    let start = publish(SET, &[], r#"{"id": "start", "run": true}"#);
+    let (head, rest) = start.split_at(20);
+    puppet.send(&[&first, head].concat());
+    puppet.wait("\"id\":\"first\"");
+    let drive = gateway.plant.load().drive("p1").unwrap();
+    let run = drive.image.spec.profile.point_index("run").unwrap();
+    let order = Order::Points(vec![(run, Value::Bool(false))]);
+    let origin = Origin::new(SourceKind::Http, "alice");
+    let mut placed = drive.place(OrderRequest::new(order, origin, Authority::Write), Instant::now());
+    let answer = runtime().block_on(placed.answered());
+    assert!(answer.outcome.is_ok(), "{answer:?}");
+    puppet.send(rest);
+    puppet.acknowledge_all(true);
+    let result = puppet.wait("\"id\":\"start\"");
+    assert!(result.contains("\"result\":\"purged\""), "{result}");
+    assert_eq!(stops(&gateway), 1);
+    assert!(gateway.ordered().iter().all(|order| order.1[0].1 != Value::Bool(true)));
     gateway.stop();
 }

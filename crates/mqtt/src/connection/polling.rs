@@ -29,7 +29,7 @@ pub(super) async fn poll(
     let mut elsewhere = String::new();
     loop {
         let event_or_end = eventloop.poll().await;
-        // Packets are read in batches: the earliest arrival of the batch counts.
+        // Packets are read in batches: the earliest arrival of the batch counts, that of a packet's first part included.
         let arrival = reader.first();
         let item = match event_or_end {
             Ok(Event::Outgoing(Outgoing::Publish(packet))) => {

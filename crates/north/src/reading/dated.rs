@@ -1,5 +1,6 @@
 //! A stream whose reader records when the bytes arrived.
 
+use std::fmt::Debug;
 use std::io;
 use std::os::fd::AsFd;
 use std::pin::Pin;
@@ -12,7 +13,7 @@ use tokio::io::{AsyncRead, AsyncWrite, DuplexStream, ReadBuf};
 use tokio::net::unix::pipe;
 use tokio::net::{TcpStream, UnixStream};
 
-use super::Reader;
+use super::{FrameEnd, Reader};
 
 /// Properties of a stream besides its bytes.
 pub trait Source {
@@ -75,16 +76,35 @@ impl Source for DuplexStream {
     }
 }
 
+/// Where the messages of a protocol begin and end.
+pub trait Frames: Debug + Send + Sync {
+    /// The next bytes; returns whether a message is complete with them.
+    fn pass(&mut self, bytes: &[u8]) -> FrameEnd;
+}
+
 /// A stream with the reader that dates its bytes.
 #[derive(Debug)]
 pub struct Dated<S> {
     stream: S,
     reader: Arc<Reader>,
+    frames: Option<Box<dyn Frames>>,
 }
 
 impl<S> Dated<S> {
     pub fn new(stream: S, reader: Arc<Reader>) -> Dated<S> {
-        Dated { stream, reader }
+        Dated {
+            stream,
+            reader,
+            frames: None,
+        }
+    }
+
+    /// A stream whose messages, in these frames, date from their first bytes in [`Reader::first`].
+    pub fn in_frames(stream: S, reader: Arc<Reader>, frames: Box<dyn Frames>) -> Dated<S> {
+        Dated {
+            frames: Some(frames),
+            ..Dated::new(stream, reader)
+        }
     }
 
     pub fn reader(&self) -> &Arc<Reader> {
@@ -102,7 +122,7 @@ impl<S: AsyncRead + Source + Unpin> AsyncRead for Dated<S> {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        let Dated { stream, reader } = &mut *self;
+        let Dated { stream, reader, frames } = &mut *self;
         let (room, before) = (buffer.remaining(), buffer.filled().len());
         let polled = Pin::new(&mut *stream).poll_read(context, buffer);
         let now = Instant::now();
@@ -111,7 +131,12 @@ impl<S: AsyncRead + Source + Unpin> AsyncRead for Dated<S> {
             Poll::Ready(Ok(())) => match buffer.filled().len() - before {
                 0 if room > 0 => reader.ended(),
                 0 => {}
-                count => reader.note_read(now, count < room, || stream.has_gone()),
+                count => {
+                    reader.note_read(now, count < room, || stream.has_gone());
+                    if let (Some(frames), Some(bytes)) = (frames, buffer.filled().get(before..)) {
+                        reader.note_end(frames.pass(bytes));
+                    }
+                }
             },
             Poll::Ready(Err(_)) => reader.ended(),
         }

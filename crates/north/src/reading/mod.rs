@@ -4,6 +4,6 @@ mod dated;
 mod reader;
 mod watch;
 
-pub use dated::{Dated, Source, is_readable};
-pub use reader::Reader;
+pub use dated::{Dated, Frames, Source, is_readable};
+pub use reader::{FrameEnd, Reader};
 pub use watch::{Watch, watched_runtime};

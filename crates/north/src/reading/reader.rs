@@ -15,6 +15,17 @@ pub struct Reader {
     state: Mutex<State>,
 }
 
+/// How the bytes of a read end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FrameEnd {
+    /// With the end of a message.
+    Whole,
+    /// Within a message that they begin.
+    Begun,
+    /// Within a message that earlier bytes began.
+    Continued,
+}
+
 #[derive(Debug)]
 struct State {
     /// Time before which no unread byte arrived.
@@ -23,8 +34,10 @@ struct State {
     waited: bool,
     /// Arrival time of the last read bytes.
     last: Dated,
-    /// Date of the first read since nothing was left.
+    /// Date of the first read since nothing was left, or of the message that was incomplete then.
     first: Dated,
+    /// Date of the first bytes of a message that is incomplete.
+    begun: Option<Dated>,
     /// Whether nothing was left after the last read.
     fresh: bool,
 }
@@ -45,6 +58,7 @@ impl Reader {
                 waited: false,
                 last: dated,
                 first: dated,
+                begun: None,
                 fresh: true,
             }),
         }
@@ -102,8 +116,22 @@ impl Reader {
         state.waited = false;
         state.last = dated;
         if std::mem::take(&mut state.fresh) {
-            state.first = dated;
+            state.first = state.begun.map_or(dated, |begun| Dated {
+                earliest: begun.earliest,
+                stall: dated.stall.or(begun.stall),
+                pause: dated.pause.or(begun.pause),
+            });
         }
+    }
+
+    /// How the bytes that were read last end; a reader without frames does not know.
+    pub(super) fn note_end(&self, end: FrameEnd) {
+        let mut state = self.state();
+        state.begun = match end {
+            FrameEnd::Whole => None,
+            FrameEnd::Begun => Some(state.last),
+            FrameEnd::Continued => state.begun.or(Some(state.last)),
+        };
     }
 
     /// The client has closed or reset the connection.
@@ -116,7 +144,8 @@ impl Reader {
         self.arrival(self.state().last)
     }
 
-    /// The earliest arrival among all bytes that were read and not taken yet.
+    /// The earliest arrival among all bytes that were read and not taken yet. Where the reader knows the frames, the first
+    /// part of a message that was completed later is among them.
     pub fn first(&self) -> Arrival {
         self.arrival(self.state().first)
     }
@@ -191,6 +220,27 @@ mod tests {
         rig.reader.ceased();
         assert_eq!(rig.note_read(5000, true), 1011, "it did not read meanwhile");
         assert_eq!(rig.ms(&rig.reader.first()), 1011);
+    }
+
+    /// A stop over another connection may come between the two parts.
+    #[test]
+    fn a_message_in_several_parts_dates_from_its_first_byte() {
+        let rig = Rig::new();
+        let read = |ms, end| {
+            rig.nothing(ms - 1);
+            rig.note_read(ms, true);
+            rig.reader.note_end(end);
+            rig.ms(&rig.reader.first())
+        };
+        assert_eq!(read(100, FrameEnd::Begun), 100);
+        assert_eq!(read(200, FrameEnd::Continued), 100);
+        assert_eq!(
+            read(300, FrameEnd::Begun),
+            100,
+            "the end of one and the begin of another"
+        );
+        assert_eq!(read(400, FrameEnd::Whole), 300);
+        assert_eq!(read(500, FrameEnd::Whole), 500);
     }
 
     #[test]
