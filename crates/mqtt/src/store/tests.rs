@@ -252,3 +252,37 @@ async fn a_list_of_topics_that_finds_no_room_leaves_nothing_behind() {
     let topics = std::fs::read_to_string(dir.path().join(MQTT_TOPICS)).unwrap();
     assert_eq!(topics, "a/b", "they are offered again");
 }
+
+fn open(buffer: &Buffer, stats: &Arc<NorthState>) -> Store {
+    Store::open(Some(buffer.clone()), "mqtt-events", stats, MqttKind::Event)
+}
+
+/// Waits for the first report of the disk; returns the topics of the last run.
+async fn opened_with(store: &mut Store) -> Vec<String> {
+    let report = store.next().await;
+    assert!(matches!(report, Loaded::Opened { .. }), "{report:?}");
+    store.take(report).1
+}
+
+/// Another gateway would clear the topics of the one to which the directory belongs.
+#[tokio::test]
+async fn without_the_lock_the_topics_of_the_owner_are_neither_read_nor_replaced() {
+    let dir = tempfile::tempdir().unwrap();
+    let buffer = Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 1 << 20,
+    };
+    let mut owner = open(&buffer, &Arc::default());
+    opened_with(&mut owner).await;
+    owner.remember(vec!["hall-a/status".to_string()]);
+    settle(&mut owner).await;
+    let mut other = open(&buffer, &Arc::default());
+    assert_eq!(opened_with(&mut other).await, Vec::<String>::new());
+    other.remember(vec!["hall-b/status".to_string()]);
+    settle(&mut other).await;
+    other.close().await;
+    let kept = || std::fs::read_to_string(dir.path().join(MQTT_TOPICS)).unwrap();
+    assert_eq!(kept(), "hall-a/status");
+    owner.close().await;
+    assert_eq!(kept(), "hall-a/status");
+}

@@ -28,7 +28,8 @@ pub(super) struct Thread {
     journal: MessageLog,
     report: mpsc::Sender<Loaded>,
     shared: Arc<Shared>,
-    topics: TopicsFile,
+    /// The list of topics; `None` without the lock, because it then belongs to another gateway.
+    topics: Option<TopicsFile>,
     /// Whether the last write failed; logged once.
     failing: bool,
     synced: Instant,
@@ -43,23 +44,9 @@ impl Thread {
         shared: Arc<Shared>,
     ) -> Thread {
         let dir = buffer.dir.clone();
-        let mut attempts = LOCK_ATTEMPTS;
-        let journal = loop {
-            attempts -= 1;
-            match MessageLog::open(&dir, name, buffer.max_bytes) {
-                Ok(journal) => break journal,
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock && attempts > 0 => {
-                    std::thread::sleep(LOCK_WAIT);
-                }
-                Err(error) => {
-                    tracing::error!(
-                        target: "drivegate::north::mqtt", "cannot keep {name} in {}: {error}; keeping them in memory; check mqtt.buffer",
-                        dir.display()
-                    );
-                    break MessageLog::in_memory();
-                }
-            }
-        };
+        let opened = open_log(buffer, name);
+        let topics = opened.is_some().then(|| TopicsFile::in_dir(&dir));
+        let journal = opened.unwrap_or_else(MessageLog::in_memory);
         let waiting = journal.waiting();
         if waiting > 0 {
             tracing::info!(
@@ -68,7 +55,7 @@ impl Thread {
             );
         }
         let thread = Thread {
-            topics: TopicsFile::in_dir(&dir),
+            topics,
             dir,
             journal,
             report,
@@ -79,7 +66,7 @@ impl Thread {
         thread.report(Loaded::Opened {
             through: thread.journal.through(),
             last: thread.journal.last,
-            topics: thread.topics.read(),
+            topics: thread.topics.as_ref().map(TopicsFile::read).unwrap_or_default(),
         });
         thread
     }
@@ -102,7 +89,7 @@ impl Thread {
                     }
                     Job::Acknowledge(number) => self.journal.acknowledge(number),
                     Job::Load(most) => load = Some(most),
-                    Job::Topics(topics) => self.topics.keep(topics),
+                    Job::Topics(topics) => self.with_topics(|file| file.keep(topics)),
                 }
                 count += 1;
                 // The report covers the messages present at this moment, no later ones.
@@ -117,7 +104,7 @@ impl Thread {
         }
         self.write();
         self.sync();
-        self.topics.retry();
+        self.with_topics(TopicsFile::retry);
         let unkept = self.journal.unkept();
         if unkept > 0 {
             self.shared.lost(unkept);
@@ -155,7 +142,7 @@ impl Thread {
             _ => {}
         }
         if self.journal.take_wiped() {
-            self.topics.restore();
+            self.with_topics(TopicsFile::restore);
         }
         self.shared.lost(self.journal.take_lost());
         let gone = self.journal.lost_up_to.get();
@@ -163,7 +150,13 @@ impl Thread {
         self.shared.missing.store(self.journal.counted, Ordering::Relaxed);
         if self.synced.elapsed() >= SYNC {
             self.sync();
-            self.topics.retry();
+            self.with_topics(TopicsFile::retry);
+        }
+    }
+
+    fn with_topics(&mut self, act: impl FnOnce(&mut TopicsFile)) {
+        if let Some(file) = &mut self.topics {
+            act(file);
         }
     }
 
@@ -175,5 +168,26 @@ impl Thread {
             tracing::warn!(target: "drivegate::north::mqtt", "{dir}: {error}; buffered messages may not survive a power failure");
         }
         self.synced = Instant::now();
+    }
+}
+
+/// Opens and locks the log; `None` if that is not possible, which is logged.
+fn open_log(buffer: &Buffer, name: &'static str) -> Option<MessageLog> {
+    let mut attempts = LOCK_ATTEMPTS;
+    loop {
+        attempts -= 1;
+        match MessageLog::open(&buffer.dir, name, buffer.max_bytes) {
+            Ok(log) => return Some(log),
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock && attempts > 0 => {
+                std::thread::sleep(LOCK_WAIT);
+            }
+            Err(error) => {
+                tracing::error!(
+                    target: "drivegate::north::mqtt", "cannot keep {name} in {}: {error}; keeping them in memory; check mqtt.buffer",
+                    buffer.dir.display()
+                );
+                return None;
+            }
+        }
     }
 }
