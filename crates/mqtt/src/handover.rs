@@ -8,6 +8,7 @@ use super::Broker;
 use super::commands::OrdersLeft;
 use super::rights::BrokerRights;
 use super::sparkplug::NodeOrdersLeft;
+use super::store::Writer;
 use drivegate_core::event::Event;
 use drivegate_north::NorthState;
 use drivegate_north::command_json::SharedMemory;
@@ -33,6 +34,8 @@ pub(super) struct Left {
     pub(super) client: ClientLeft<OrdersLeft>,
     /// State of the Sparkplug edge node.
     pub(super) node: ClientLeft<NodeOrdersLeft>,
+    /// The threads that write, or still write, the messages of the clients.
+    pub(super) writers: Vec<Writer>,
 }
 
 /// State that one of the clients left.
@@ -68,12 +71,14 @@ impl Handover {
         self.lock().unread = Some(events);
     }
 
-    /// Discards the state of the last clients if no client takes it over; the retained topics still have to be cleared.
+    /// Discards the state of the last clients if no client takes it over; the retained topics still have to be cleared,
+    /// and files that are being written still have to be waited for.
     pub fn discard(&self) {
         let mut left = self.lock();
-        let retained = std::mem::take(&mut left.retained);
+        let (retained, writers) = (std::mem::take(&mut left.retained), std::mem::take(&mut left.writers));
         *left = Left {
             retained,
+            writers,
             ..Left::default()
         };
     }

@@ -7,14 +7,16 @@
 mod thread;
 mod topics_file;
 
-use std::sync::Arc;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Weak};
 
 use flume::{Sender, TrySendError};
 use tokio::sync::mpsc;
 
 use self::thread::Thread;
 use super::Buffer;
+use super::handover::Handover;
 use super::number::MessageNumber;
 use super::outbox::{KEPT_BYTES, Message};
 use drivegate_north::{MqttKind, NorthState};
@@ -98,6 +100,36 @@ struct Shared {
     missing: AtomicU64,
 }
 
+/// A thread that writes, or waits to write, the messages of one kind in a directory.
+#[derive(Debug, Clone)]
+pub(super) struct Writer {
+    kind: MqttKind,
+    dir: PathBuf,
+    /// Dropped by the thread when it ends.
+    shared: Weak<Shared>,
+}
+
+impl Writer {
+    fn is_running(&self) -> bool {
+        self.shared.strong_count() > 0
+    }
+
+    /// Adds the writer of a new store; returns those before it that have the same files and are still running.
+    fn begin(stats: &NorthState, kind: MqttKind, dir: &Path, shared: &Arc<Shared>) -> Vec<Writer> {
+        let handover = Handover::of(stats);
+        let mut left = handover.lock();
+        left.writers.retain(Writer::is_running);
+        let same = |writer: &&Writer| writer.kind == kind && writer.dir == dir;
+        let before = left.writers.iter().filter(same).cloned().collect();
+        left.writers.push(Writer {
+            kind,
+            dir: dir.to_path_buf(),
+            shared: Arc::downgrade(shared),
+        });
+        before
+    }
+}
+
 impl Shared {
     fn new(stats: Arc<NorthState>, kind: MqttKind) -> Arc<Shared> {
         Arc::new(Shared {
@@ -176,7 +208,8 @@ impl Store {
         let (sender, loaded) = mpsc::channel(4);
         let shared = Shared::new(stats.clone(), kind);
         let of_thread = shared.clone();
-        let work = move || Thread::open(&buffer, name, sender, of_thread).work(&todo);
+        let before = Writer::begin(stats, kind, &buffer.dir, &shared);
+        let work = move || Thread::open(&buffer, name, sender, (of_thread, &before)).work(&todo);
         match std::thread::Builder::new().name(name.to_string()).spawn(work) {
             Ok(_) => Store {
                 disk: Some(Disk {

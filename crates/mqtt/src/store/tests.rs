@@ -4,6 +4,7 @@ use flume::Receiver;
 
 use super::super::Qos;
 use super::super::outbox::{Delivery, Outbox};
+use super::thread::{LOCK_ATTEMPTS, LOCK_WAIT};
 use super::*;
 
 fn lost(stats: &NorthState) -> u64 {
@@ -285,4 +286,33 @@ async fn without_the_lock_the_topics_of_the_owner_are_neither_read_nor_replaced(
     assert_eq!(kept(), "hall-a/status");
     owner.close().await;
     assert_eq!(kept(), "hall-a/status");
+}
+
+/// The store of the client before a reload still writes when that of the next client begins.
+#[tokio::test]
+async fn a_store_follows_the_one_before_however_long_that_writes() {
+    let dir = tempfile::tempdir().unwrap();
+    let buffer = Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 1 << 20,
+    };
+    let stats = Arc::<NorthState>::default();
+    let mut before = open(&buffer, &stats);
+    opened_with(&mut before).await;
+    (0..3).for_each(|n| drop(before.push(event(n), false)));
+    before.remember(vec!["a/b".to_string()]);
+    // A thread that is waiting for the disk has its jobs, like this one.
+    let writing = before.disk.as_ref().map(|disk| disk.jobs.clone());
+    drop(before);
+    let mut store = open(&buffer, &stats);
+    store.push(event(3), true);
+    // A lock that somebody else has is waited for as long as this, at most.
+    tokio::time::sleep(LOCK_WAIT * (LOCK_ATTEMPTS + 10)).await;
+    drop(writing);
+    assert_eq!(opened_with(&mut store).await, ["a/b"]);
+    assert_eq!(store.waiting(), 4);
+    store.close().await;
+    let mut store = open(&buffer, &stats);
+    opened_with(&mut store).await;
+    assert_eq!(store.waiting(), 4, "all are on disk");
 }

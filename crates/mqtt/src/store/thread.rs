@@ -12,15 +12,16 @@ use tokio::sync::mpsc;
 use super::super::Buffer;
 use super::super::message_log::MessageLog;
 use super::topics_file::TopicsFile;
-use super::{Job, Loaded, Shared};
+use super::{Job, Loaded, Shared, Writer};
 
 /// Messages that are written at a time.
 const BATCH: usize = 1024;
 /// Time after which messages on disk survive a power failure.
 const SYNC: Duration = Duration::from_secs(1);
-/// Attempts to lock the directory, and the wait between them: a process that is stopping may still have it locked.
-const LOCK_ATTEMPTS: u32 = 20;
-const LOCK_WAIT: Duration = Duration::from_millis(50);
+/// Attempts to lock the directory, and the wait between them: a process that is stopping may still have it locked. The
+/// client before a reload is waited for without a limit.
+pub(super) const LOCK_ATTEMPTS: u32 = 20;
+pub(super) const LOCK_WAIT: Duration = Duration::from_millis(50);
 
 /// The thread that owns the files.
 pub(super) struct Thread {
@@ -41,10 +42,10 @@ impl Thread {
         buffer: &Buffer,
         name: &'static str,
         report: mpsc::Sender<Loaded>,
-        shared: Arc<Shared>,
+        (shared, before): (Arc<Shared>, &[Writer]),
     ) -> Thread {
         let dir = buffer.dir.clone();
-        let opened = open_log(buffer, name);
+        let opened = open_log(buffer, name, before);
         let topics = opened.is_some().then(|| TopicsFile::in_dir(&dir));
         let journal = opened.unwrap_or_else(MessageLog::in_memory);
         let waiting = journal.waiting();
@@ -171,14 +172,24 @@ impl Thread {
     }
 }
 
-/// Opens and locks the log; `None` if that is not possible, which is logged.
-fn open_log(buffer: &Buffer, name: &'static str) -> Option<MessageLog> {
-    let mut attempts = LOCK_ATTEMPTS;
+/// Opens and locks the log, after the writers `before`, which have locked it and write what they have; `None` if that is
+/// not possible, which is logged.
+fn open_log(buffer: &Buffer, name: &'static str, before: &[Writer]) -> Option<MessageLog> {
+    let mut attempts = 0;
     loop {
-        attempts -= 1;
+        // A writer unlocks the log before it ends, so the attempt after its end finds no lock of it.
+        let is_written = before.iter().any(Writer::is_running);
         match MessageLog::open(&buffer.dir, name, buffer.max_bytes) {
             Ok(log) => return Some(log),
-            Err(error) if error.kind() == io::ErrorKind::WouldBlock && attempts > 0 => {
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock && (is_written || attempts < LOCK_ATTEMPTS) => {
+                attempts += 1;
+                if attempts == LOCK_ATTEMPTS && is_written {
+                    tracing::warn!(
+                        target: "drivegate::north::mqtt", "{}: the disk is slow, {name} from before the reload are \
+                                                           still being written; new ones wait",
+                        buffer.dir.display()
+                    );
+                }
                 std::thread::sleep(LOCK_WAIT);
             }
             Err(error) => {
