@@ -61,6 +61,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::task::JoinHandle;
+use tokio::time::{Instant, timeout_at};
 use tokio_util::sync::CancellationToken;
 
 use drivegate_core::plant::SharedPlant;
@@ -205,6 +206,9 @@ impl Buffer {
     }
 }
 
+/// Part of [`Server::STOP_TIMEOUT`] for the end of a client that is aborted.
+const ABORT: Duration = Duration::from_millis(100);
+
 /// The running MQTT client.
 #[derive(Debug, Default)]
 pub struct Mqtt {
@@ -234,14 +238,30 @@ impl Server for Mqtt {
         }
     }
 
-    /// Waits for the end of the client: at most about half a second after the cancellation, during which it
-    /// publishes `offline` and disconnects.
-    async fn stopped(self) {
-        for task in self.tasks {
-            if let Err(error) = task.await {
-                tracing::error!(target: "drivegate::north::mqtt", "the MQTT client ended unexpectedly: {error}");
+    /// Waits for the end of the clients: they finish the commands in progress, publish `offline` and disconnect. A client
+    /// that takes too long is aborted, so that it changes nothing when its successor runs.
+    async fn stopped(mut self) {
+        let until = Instant::now() + Self::STOP_TIMEOUT - ABORT;
+        for task in &mut self.tasks {
+            match timeout_at(until, &mut *task).await {
+                Ok(Ok(())) => {}
+                Ok(Err(error)) => {
+                    tracing::error!(target: "drivegate::north::mqtt", "the MQTT client ended unexpectedly: {error}");
+                }
+                Err(_) => {
+                    tracing::warn!(target: "drivegate::north::mqtt", "the MQTT client did not end in time and is aborted");
+                    task.abort();
+                    // The task has ended when this returns.
+                    let _ = task.await;
+                }
             }
         }
+    }
+}
+
+impl Drop for Mqtt {
+    fn drop(&mut self) {
+        self.tasks.iter().for_each(JoinHandle::abort);
     }
 }
 

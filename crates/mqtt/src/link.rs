@@ -6,6 +6,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use rumqttc::mqttbytes::v5::Filter;
+use rustls::ClientConfig;
+use tokio::sync::Semaphore;
+use tokio::task::JoinHandle;
 
 use super::back_off::Rotation;
 use super::broker_limits::{BrokerLimits, WillForm};
@@ -17,6 +20,7 @@ use super::reasons::CLOSED;
 use super::session::Will;
 use super::takeover::Takeovers;
 use super::{Broker, Options, Password, Secret};
+use drivegate_north::patience::{DISK, late};
 use drivegate_north::{LinkStatus, tls};
 
 /// The reasons of a broker that does not accept a password (any more): 0x86 and 0x87.
@@ -32,10 +36,15 @@ pub(super) enum Due {
     GiveUp(&'static str),
 }
 
+/// Configuration of TLS and the password of an attempt.
+type Credentials = (Option<Arc<ClientConfig>>, Option<Secret>);
+
 #[derive(Debug)]
 enum State {
     /// No connection; the next attempt follows at `retry_at`.
     Down { retry_at: Instant },
+    /// Certificates and password are being read; the connection will have this last will.
+    Reading(JoinHandle<Result<Credentials, String>>, Will),
     /// An open connection that the broker may not have accepted yet.
     Up(Box<Connection>, Phase),
 }
@@ -75,6 +84,8 @@ pub(super) struct BrokerLink {
     password: Option<Secret>,
     /// A password from a file that the broker refused, and when it may be tried again.
     refused: Option<(Secret, Instant)>,
+    /// The right to read the files: one thread at most waits for a disk that hangs.
+    reads: Arc<Semaphore>,
     status: Arc<LinkStatus>,
 }
 
@@ -109,6 +120,7 @@ impl BrokerLink {
             takeovers: Takeovers::default(),
             password: None,
             refused: None,
+            reads: Arc::new(Semaphore::new(1)),
             status,
         };
         link.status.begin(link.broker().to_string(), SystemTime::now());
@@ -133,7 +145,7 @@ impl BrokerLink {
     pub(super) fn limits(&self) -> Option<BrokerLimits> {
         match &self.state {
             State::Up(_, phase) => phase.limits().copied(),
-            State::Down { .. } => None,
+            State::Down { .. } | State::Reading(..) => None,
         }
     }
 
@@ -149,6 +161,10 @@ impl BrokerLink {
     pub(super) async fn next(&mut self) -> Step {
         let step = match &mut self.state {
             State::Down { .. } => std::future::pending().await,
+            State::Reading(reading, _) => {
+                let read = reading.await.unwrap_or_else(|error| Err(error.to_string()));
+                return self.open(read);
+            }
             State::Up(connection, _) => connection.next().await,
         };
         self.apply(step)
@@ -202,7 +218,7 @@ impl BrokerLink {
     pub(super) fn due(&mut self, now: Instant) -> Due {
         match &mut self.state {
             State::Down { retry_at } if now >= *retry_at => Due::Connect,
-            State::Down { .. } => Due::Nothing,
+            State::Down { .. } | State::Reading(..) => Due::Nothing,
             State::Up(_, Phase::Subscribing { since, .. })
                 if now.saturating_duration_since(*since) > SUBSCRIBE_TIMEOUT =>
             {
@@ -218,34 +234,35 @@ impl BrokerLink {
         }
     }
 
-    /// Starts to connect to the next broker, with this last will.
-    ///
-    /// # Errors
-    /// If the link cannot connect; contains the reason.
-    pub(super) async fn connect(&mut self, will: Will) -> Result<(), String> {
-        let options = self.options.clone();
-        // The files are read for each attempt, so that renewed certificates and tokens are used without a restart.
-        let read = move || {
-            let own = options.identity.as_ref();
-            let own = own.map(|(certificate, key)| (certificate.as_path(), key.as_path()));
-            let config = options
-                .tls
-                .then(|| tls::client(options.ca.as_deref(), own))
-                .transpose()?;
-            let password = options.password.as_ref().map(Password::read).transpose()?;
-            Ok::<_, String>((config, password))
+    /// Starts to connect to the next broker, with this last will. Nothing waits for the disk: [`BrokerLink::next`] goes on
+    /// when the files are read, and reports a lost connection if they cannot be.
+    pub(super) fn connect(&mut self, will: Will) {
+        let read = read_credentials(self.options.clone(), self.reads.clone());
+        let read = async {
+            tokio::time::timeout(DISK, read)
+                .await
+                .unwrap_or_else(|_| Err(late_files()))
         };
-        let read = tokio::task::spawn_blocking(read)
-            .await
-            .map_err(|error| error.to_string())?;
-        let (config, password) = read?;
+        self.state = State::Reading(tokio::spawn(read), will);
+    }
+
+    /// Opens the connection with the credentials that were read.
+    fn open(&mut self, read: Result<Credentials, String>) -> Step {
+        let retry_at = Instant::now();
+        let State::Reading(_, will) = std::mem::replace(&mut self.state, State::Down { retry_at }) else {
+            return Step::Nothing;
+        };
+        let (config, password) = match read {
+            Ok(read) => read,
+            Err(why) => return Step::Lost(why),
+        };
         if let Some((_, retry_at)) = self
             .refused
             .take_if(|(refused, _)| Some(&*refused) == password.as_ref())
         {
             // A password that was refused would be refused again.
             self.state = State::Down { retry_at };
-            return Ok(());
+            return Step::Nothing;
         }
         self.password.clone_from(&password);
         let will = self.will.will(will);
@@ -254,14 +271,14 @@ impl BrokerLink {
         let dial = (self.dial.clone(), self.rotation.round());
         let connection = Connection::open(&self.options, target, (will, password), config, dial);
         self.state = State::Up(Box::new(connection), Phase::Connecting);
-        Ok(())
+        Step::Nothing
     }
 
     /// The connection that the broker accepted, and the capabilities of the broker.
     fn accepted(&mut self) -> Option<(&mut Connection, BrokerLimits)> {
         match &mut self.state {
             State::Up(connection, phase) => phase.limits().map(|limits| (&mut **connection, *limits)),
-            State::Down { .. } => None,
+            State::Down { .. } | State::Reading(..) => None,
         }
     }
 
@@ -379,7 +396,30 @@ impl BrokerLink {
         let retry_at = now + wait.unwrap_or(usual);
         match std::mem::replace(&mut self.state, State::Down { retry_at }) {
             State::Up(connection, _) => Some(*connection),
-            State::Down { .. } => None,
+            State::Down { .. } | State::Reading(..) => None,
         }
     }
+}
+
+/// Reads certificates and password for an attempt, so that renewed ones are used without a restart.
+async fn read_credentials(options: Arc<Options>, reads: Arc<Semaphore>) -> Result<Credentials, String> {
+    let permit = reads.acquire_owned().await.map_err(|error| error.to_string())?;
+    let read = move || {
+        let _permit = permit;
+        let own = options.identity.as_ref();
+        let own = own.map(|(certificate, key)| (certificate.as_path(), key.as_path()));
+        let config = options
+            .tls
+            .then(|| tls::client(options.ca.as_deref(), own))
+            .transpose()?;
+        let password = options.password.as_ref().map(Password::read).transpose()?;
+        Ok((config, password))
+    };
+    tokio::task::spawn_blocking(read)
+        .await
+        .map_err(|error| error.to_string())?
+}
+
+fn late_files() -> String {
+    format!("the files with certificates and password cannot be read: {}", late())
 }

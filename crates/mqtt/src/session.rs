@@ -25,6 +25,7 @@ const LEAVE: Duration = Duration::from_millis(500);
 const LAST_COMMANDS: Duration = Duration::from_secs(3);
 
 /// The last will of a connection.
+#[derive(Debug)]
 pub(super) struct Will {
     pub(super) topic: String,
     pub(super) payload: Vec<u8>,
@@ -147,9 +148,7 @@ async fn check(client: &mut impl Client, now: Instant) {
     match client.common().link.due(now) {
         Due::Connect => {
             let will = client.will().await;
-            if let Err(why) = client.common().link.connect(will).await {
-                lost(client, &why);
-            }
+            client.common().link.connect(will);
         }
         Due::GiveUp(why) => give_up(client, why),
         Due::Nothing => {}

@@ -254,3 +254,55 @@ async fn a_client_takes_what_the_one_before_left_when_it_is_started() {
     drivegate_north::Server::stopped(started).await;
     assert!(handover.lock().client.orders.is_some(), "and leaves it to the next one");
 }
+
+/// A disk that hangs is imitated by a named pipe, into which nothing is written.
+#[tokio::test]
+async fn a_password_file_that_hangs_ends_the_attempt_and_delays_no_stop() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("token");
+    let mode = rustix::fs::Mode::from_raw_mode(0o600);
+    rustix::fs::mknodat(rustix::fs::CWD, &path, rustix::fs::FileType::Fifo, mode, 0).unwrap();
+    let mut options = options(None);
+    options.username = Some("hall".to_string());
+    options.password = Some(crate::Password::File(path.clone()));
+    let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(fixture::plant(&["p1"])));
+    let (stats, cancel) = (Arc::<NorthState>::default(), CancellationToken::new());
+    let started = crate::start(options, plant, stats.clone(), cancel.clone());
+    // The pipe opens for writing once somebody reads it.
+    let writer = loop {
+        let flags = rustix::fs::OFlags::WRONLY | rustix::fs::OFlags::NONBLOCK;
+        match rustix::fs::open(&path, flags, rustix::fs::Mode::empty()) {
+            Ok(writer) => break writer,
+            Err(_) => tokio::time::sleep(Duration::from_millis(5)).await,
+        }
+    };
+    let error = || stats.mqtt.plain.get().and_then(|state| state.error);
+    while error().is_none() {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    let (_, why) = error().unwrap();
+    assert!(why.contains("did not answer in time"), "{why}");
+    cancel.cancel();
+    drivegate_north::Server::stopped(started).await;
+    assert!(!stats.mqtt.configured.load(Ordering::Relaxed));
+    drop(writer);
+}
+
+#[tokio::test]
+async fn a_client_that_does_not_end_is_aborted_before_the_next_one_starts() {
+    let (guard, mut ended) = tokio::sync::oneshot::channel::<()>();
+    let stuck = tokio::spawn(async move {
+        let _guard = guard;
+        std::future::pending::<()>().await;
+    });
+    let stuck = crate::Mqtt {
+        tasks: vec![stuck],
+        rights: None,
+    };
+    drivegate_north::Server::stopped(stuck).await;
+    assert!(
+        ended
+            .try_recv()
+            .is_err_and(|error| error == tokio::sync::oneshot::error::TryRecvError::Closed)
+    );
+}
