@@ -136,8 +136,13 @@ fn bare(payload: &[u8]) -> Result<Json, Refusal> {
         "false" => Ok(Json::Bool(false)),
         // JSON numbers, and what people write instead: +5, .5, 007. No NaN, no infinity.
         _ if text.chars().all(|c| c.is_ascii_digit() || "+-.eE".contains(c)) => {
-            let number: f64 = text.parse().map_err(|_| bad())?;
-            serde_json::Number::from_f64(number).map(Json::Number).ok_or_else(bad)
+            // A whole number keeps every digit.
+            let whole = text.parse::<i64>().map(Json::from);
+            let whole = whole.or_else(|_| text.parse::<u64>().map(Json::from));
+            whole.or_else(|_| {
+                let number: f64 = text.parse().map_err(|_| bad())?;
+                serde_json::Number::from_f64(number).map(Json::Number).ok_or_else(bad)
+            })
         }
         _ => Err(bad()),
     }
@@ -376,14 +381,13 @@ mod tests {
         for bad in ["night", "twice", "Off"] {
             assert!(value(Some("mode"), bad).is_err(), "{bad}");
         }
-        assert_eq!(
-            value(None, r#"{"count": 9007199254740993}"#),
-            Ok(Value::Integer(9_007_199_254_740_993))
-        );
-        assert_eq!(
-            value(None, r#"{"count": 18446744073709551615}"#),
-            Ok(Value::Unsigned(u64::MAX))
-        );
+        for (number, wanted) in [
+            ("9007199254740993", Value::Integer(9_007_199_254_740_993)),
+            ("18446744073709551615", Value::Unsigned(u64::MAX)),
+        ] {
+            assert_eq!(value(None, &format!("{{\"count\": {number}}}")), Ok(wanted));
+            assert_eq!(value(Some("count"), number), Ok(wanted));
+        }
     }
 
     #[test]
