@@ -445,10 +445,11 @@ impl Outbox {
             }
             Key::Queued(kind, place) if for_now => {
                 let queue = self.queue_mut(*kind);
-                queue.put_back = true;
                 let entry = queue.get_mut(*place)?;
                 entry.in_flight = false;
-                entry.message.topic.clone()
+                let topic = entry.message.topic.clone();
+                queue.put_back = true;
+                topic
             }
             Key::Queued(..) => return None,
         };

@@ -179,6 +179,27 @@ fn results_beyond_the_bound_push_out_the_oldest_that_are_not_in_flight() {
     assert_eq!((outbox.waiting(), lost(&mut outbox, MqttKind::Result)), (most, 5));
 }
 
+/// The message that the broker refuses for now was dropped meanwhile: nothing waits for another attempt.
+#[test]
+fn a_refusal_of_a_dropped_message_holds_up_no_other() {
+    let mut outbox = outbox();
+    let long = |name: &str| Message {
+        correlation: Some(vec![0; RESULT_BYTES / 2 - 10]),
+        ..event(name)
+    };
+    for name in ["one", "two"] {
+        outbox.push_result(long(name));
+    }
+    assert_eq!(names(&drain(&mut outbox, 1)), ["one"]);
+    outbox.numbered(1).unwrap();
+    assert_eq!(names(&drain(&mut outbox, 2)), ["two"]);
+    outbox.push_result(long("three"));
+    assert_eq!(lost(&mut outbox, MqttKind::Result), 1, "both are in flight, the older one is dropped");
+    assert_eq!(outbox.put_back(1, true), None);
+    outbox.acked(1);
+    assert_eq!(names(&drain(&mut outbox, 2)), ["three"]);
+}
+
 #[test]
 fn telemetry_without_acknowledgement_passes_a_full_window() {
     let mut outbox = Outbox::new(Delivery {
