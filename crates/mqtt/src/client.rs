@@ -420,8 +420,11 @@ impl session::Client for PlainClient {
         let (now, wall) = (Instant::now(), SystemTime::now());
         self.common.look_at = match (self.is_alive(), self.options.telemetry.history) {
             (true, _) => {
-                for topic in self.publisher.cleared() {
-                    self.outbox.put_lasting(topic, Vec::new());
+                // Without the retain flag nothing would be cleared; the topics wait for a connection with it.
+                if self.common.link.ready().is_some_and(|limits| limits.retains) {
+                    for topic in self.publisher.cleared() {
+                        self.outbox.put_lasting(topic, Vec::new());
+                    }
                 }
                 let (updates, next) = self.publisher.tick(now, wall);
                 for Update { topic, payload } in updates {

@@ -5,9 +5,11 @@ use std::net::{TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
+use drivegate_core::event::EventKind;
 use drivegate_core::order::{Authority, Order, Origin, SourceKind};
 use drivegate_core::plant::OrderRequest;
 use drivegate_model::drive::Value;
+use drivegate_mqtt::Buffer;
 use drivegate_testkit::mqtt as packets;
 
 use super::bench::*;
@@ -204,4 +206,32 @@ fn a_packet_in_two_parts_is_as_old_as_the_first() {
     assert_eq!(stops(&gateway), 1);
     assert!(gateway.ordered().iter().all(|order| order.1[0].1 != Value::Bool(true)));
     gateway.stop();
+}
+
+/// A message without the retain flag clears nothing, so the topics of an earlier run stay on the list.
+#[test]
+fn without_retained_messages_no_topic_is_cleared_and_none_is_forgotten() {
+    let dir = tempfile::tempdir().unwrap();
+    let list = dir.path().join("mqtt-topics");
+    std::fs::write(&list, "drivegate/hall/drive/gone/state").unwrap();
+    let puppet = Puppet::start();
+    let mut options = options(puppet.port);
+    options.retain = false;
+    options.buffer = Some(Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 1 << 20,
+    });
+    let gateway = Gateway::start(options, plant(&["p1"]));
+    puppet.wait("/status");
+    puppet.acknowledge_all(true);
+    let topics = || std::fs::read_to_string(&list).unwrap();
+    wait_for("the topics of this run", || topics().contains("p1/state").then_some(()));
+    for text in ["first", "second"] {
+        gateway.publish_event("p1", EventKind::Fault, text);
+        puppet.wait(text);
+    }
+    gateway.stop();
+    let seen = puppet.seen.lock().unwrap();
+    assert!(!seen.messages.iter().any(|message| message.contains("gone")));
+    assert!(topics().contains("drivegate/hall/drive/gone/state"));
 }
