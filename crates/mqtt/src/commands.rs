@@ -406,7 +406,7 @@ fn repeats(why: &str) -> String {
 }
 
 impl PendingCommand {
-    /// Replaces the client as a reload does; the new client continues with the commands of the old one.
+    /// Size of what the command keeps from its message.
     fn bytes(&self) -> usize {
         self.reply.bytes() + self.id.as_ref().map_or(0, |id| id.text().len())
     }

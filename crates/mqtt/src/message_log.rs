@@ -70,7 +70,7 @@ pub(super) struct MessageLog {
     /// Number up to which no messages are kept, because the buffer was full. Messages up to this number that were
     /// taken and not acknowledged are lost.
     pub(super) lost_up_to: MessageNumber,
-    /// The files were deleted since the last call of [`Journal::take_wiped`].
+    /// The files were deleted since the last call of [`MessageLog::take_wiped`].
     wiped: bool,
 }
 
@@ -221,7 +221,7 @@ impl MessageLog {
         std::mem::take(&mut self.wiped)
     }
 
-    /// Appends a message; [`Journal::write`] writes it. A message that is already `taken` is kept only until it is
+    /// Appends a message; [`MessageLog::write`] writes it. A message that is already `taken` is kept only until it is
     /// acknowledged.
     pub(super) fn append(&mut self, message: Message, taken: bool) {
         self.last = self.last.next();

@@ -115,7 +115,7 @@ pub(super) trait Client {
     async fn say_goodbye(&mut self) -> bool;
 }
 
-/// Runs a client until `cancel`, then ends it: commands in progress are completed first.
+/// Runs a client until `cancel`; [`end`] then ends it.
 pub(super) async fn run(client: &mut impl Client, cancel: CancellationToken) {
     let mut checks = tokio::time::interval(CHECK);
     checks.set_missed_tick_behavior(MissedTickBehavior::Delay);

@@ -126,7 +126,7 @@ impl PlainClient {
         self.store.remember(topics);
     }
 
-    /// Counts the messages that the outbox has lost, and logs their number once a minute.
+    /// Counts as lost, and logs, the messages that end with the client because they are only in memory.
     pub(super) fn count_unkept(&mut self) {
         let (events, history) = (
             self.outbox.unkept(MqttKind::Event),
