@@ -9,6 +9,7 @@ use std::time::{Duration, SystemTime};
 use rcgen::{CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, KeyPair, KeyUsagePurpose};
 use ring::digest::{SHA256, digest};
 
+use super::check::group_remedy;
 use super::failure::Outcome;
 use super::{printable, report};
 use drivegate_http::is_host;
@@ -78,6 +79,7 @@ fn new(hosts: &[String], out: &Path, days: u16, now: SystemTime) -> Result<Strin
         return Err(error);
     }
     let shown = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
+    let remedy = group_remedy(&shown(&key), "g+r");
     let [key, certificate] = [key, certificate].map(|path| format!("{:?}", shown(&path).display().to_string()));
     let (until, fingerprint) = (&made.until, &made.fingerprint);
     let names: Vec<String> = hosts
@@ -87,7 +89,7 @@ fn new(hosts: &[String], out: &Path, days: u16, now: SystemTime) -> Result<Strin
     Ok(format!(
         "The certificate is valid until {until}; its SHA-256 fingerprint, which browsers show, is\n{fingerprint}\n\n\
          [http]\nlisten = \"0.0.0.0:9488\"\nhosts = [{}]\ncertificate = {certificate}\nkey = {key}\n\n\
-         The service needs to read the key: chown it to its user, drivegate.\n",
+         For the service to read the key, {remedy}; check with `drivegate check --as-service`.\n",
         names.join(", ")
     ))
 }
@@ -170,6 +172,7 @@ mod tests {
         let text = new(&hosts, dir.path(), 825, SystemTime::now()).unwrap();
         assert!(text.contains("hosts = [\"gateway.example\", \"192.0.2.7\"]"), "{text}");
         let (key, certificate) = (dir.path().join(KEY), dir.path().join(CERTIFICATE));
+        assert!(text.contains(&format!("chmod g+r {}", key.display())), "{text}");
         assert_eq!(fs::metadata(&key).unwrap().mode() & 0o777, 0o600);
         let before = fs::read(&key).unwrap();
         let error = new(&hosts, dir.path(), 825, SystemTime::now()).unwrap_err();

@@ -11,6 +11,8 @@ use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
 
+pub(crate) use as_service::group_remedy;
+
 use super::failure::{Failure, Outcome};
 use super::{EXIT_CONFIG, NamedConfig, report};
 use drivegate_bus::predict::{PredictedRequest, Prediction};

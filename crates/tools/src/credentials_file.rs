@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use super::check::group_remedy;
 use drivegate_http::{Credential, Credentials};
 
 /// Time that another program may take to change the file.
@@ -39,6 +40,12 @@ impl<C: Filed> CredentialsFile<C> {
             path: path.to_path_buf(),
             of: PhantomData,
         }
+    }
+
+    /// What to do with a new file, in one line: the user of the service does not own it.
+    pub(super) fn remedy(&self) -> String {
+        let path = std::path::absolute(&self.path).unwrap_or_else(|_| self.path.clone());
+        format!("for the service to read it, {}\n", group_remedy(&path, "g+r"))
     }
 
     /// Reads the text of the file.
@@ -245,6 +252,15 @@ mod tests {
         file(&path).change(|text| Ok(replaced(text, "n7", None))).unwrap();
         assert_eq!(file(&path).read().unwrap().lines().count(), 15);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn the_service_gets_a_new_file_through_a_group() {
+        let remedy = file(Path::new("/etc/drivegate/tokens")).remedy();
+        assert!(
+            remedy.contains("chgrp GROUP /etc/drivegate/tokens && chmod g+r"),
+            "{remedy}"
+        );
     }
 
     #[test]

@@ -69,7 +69,10 @@ pub(super) fn run(args: &Args) -> Outcome {
 fn add(file: &TokenFile, name: &str, scopes: &[Scope]) -> Result<String, String> {
     let (token, secret) = Token::generate(name, scopes.to_vec())
         .map_err(|error| format!("{error}; {}; choose another name", file.path.display()))?;
+    let remedy = (!file.path.exists()).then(|| file.remedy());
     file.put(&token, false)?;
+    // Standard output has nothing but the token, which it often writes to a file.
+    eprint!("{}", remedy.unwrap_or_default());
     Ok(format!("{secret}\n"))
 }
 

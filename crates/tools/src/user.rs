@@ -55,7 +55,7 @@ type UsersFile = CredentialsFile<User>;
 
 impl Filed for User {
     const FILE: &'static str = "users";
-    const MODE: u32 = 0o600;
+    const MODE: u32 = 0o640;
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
@@ -71,16 +71,19 @@ pub(super) fn run(args: &Args) -> Outcome {
 }
 
 fn add(file: &UsersFile, name: &str) -> Result<String, String> {
-    if file.path.exists() {
+    let remedy = if file.path.exists() {
         // The file is checked before the password prompt.
         file.list()?;
-    }
+        String::new()
+    } else {
+        file.remedy()
+    };
     let user =
         User::new(name, &password()?).map_err(|error| format!("{error}; {}; choose another", file.path.display()))?;
     Ok(if file.put(&user, true)? {
         format!("{name} has a new password; reload the gateway\n")
     } else {
-        format!("{name} was added; reload the gateway\n{}", lines(&file.path))
+        format!("{name} was added; reload the gateway\n{remedy}{}", lines(&file.path))
     })
 }
 

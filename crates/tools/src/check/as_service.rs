@@ -141,6 +141,12 @@ pub(super) fn problems(path: &Path) -> Vec<Problem> {
     lasting.filter_map(|file| problem(path, file, &service)).collect()
 }
 
+/// The commands by which the service gets this permission of a file or directory, `g+r` or `g+x`, through a group.
+pub(crate) fn group_remedy(path: &Path, bits: &str) -> String {
+    let shown = path.display();
+    format!("give it a group of the service: chgrp GROUP {shown} && chmod {bits} {shown}")
+}
+
 fn problem(config: &Path, file: &NamedFile, service: &Service) -> Option<Problem> {
     // A missing file is reported by the code that reads it.
     let whole = file.path.canonicalize().ok()?;
@@ -176,7 +182,7 @@ fn problem(config: &Path, file: &NamedFile, service: &Service) -> Option<Problem
             meta.gid(),
             service.shown
         ),
-        format!("give it a group of the service: chgrp GROUP {refusing} && chmod {bits} {refusing}"),
+        group_remedy(&step, bits),
     ))
 }
 
