@@ -55,7 +55,7 @@ struct DemoLine {
     drives: &'static [(&'static str, &'static str)],
 }
 
-/// The lines of the demo, which cover every protocol and every family of the reference.
+/// The lines of the demo, which cover every protocol and every verified family.
 const LINES: [DemoLine; 5] = [
     DemoLine {
         name: "line1",

@@ -20,8 +20,8 @@ const LOOK: Duration = Duration::from_millis(500);
 /// Proves that a motor stops: by a command, when its client goes silent, when the gateway goes silent.
 ///
 /// The motor is started at low speed and stopped in each way, and the time to standstill is measured. You must type the
-/// drive's name before it starts; Ctrl-C ends the drill and stops the motor. Keep a hand on the switch, and nobody at
-/// the machine.
+/// drive's name before it starts; Ctrl-C ends the drill and stops the motor. One person watches the machine
+/// with a hand on its switch; nobody is in its danger zone.
 #[derive(Debug, clap::Args)]
 #[command(
     args_conflicts_with_subcommands = true,

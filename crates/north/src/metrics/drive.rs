@@ -154,7 +154,7 @@ fn permit_families<'a>() -> Vec<Row<DriveFigures<'a>>> {
         Counter "drivegate_supervision_failed_total"
             "Failed attempts at the action of a lease, or at the stop at shutdown."
             => |drive, series| series.add(drive.image.supervision_failures());
-        Gauge "drivegate_drive_unsupervised" "1 if a drive with supervision runs without a lease, else 0."
+        Gauge "drivegate_drive_unsupervised" "1 if a drive with supervision was found running after the start and is not yet commanded, else 0."
             => |drive, series| if drive.image.spec.supervision.is_some() {
                 series.add(drive.image.is_unsupervised());
             };

@@ -15,7 +15,7 @@ pub(super) fn text(place: &DemoPlace, sides: &Sides) -> String {
     };
     format!(
         "\
-drivegate {} demo: simulated drives of every family and protocol, true wire timing, no hardware.
+drivegate {} demo: simulated drives of the verified families and every protocol, true wire timing, no hardware.
 {}
 The drives start, stop, ramp and occasionally fault on their own until you command them.
 mbpoll and the mosquitto clients are separate programs: apt install mbpoll mosquitto-clients

@@ -88,7 +88,7 @@ keys! {
             parse: parse_filter, empty: None, range: "topic filters, such as [\"drivegate/answers/#\"]",
         }, default [];
         /// Where events and history are buffered while the broker is unreachable.
-        buffer: Present = Own { schema: Buffer::schema, range: "[mqtt.buffer]" }, or "in memory only";
+        buffer: Present = Own { schema: Buffer::schema, range: "[mqtt.buffer]" }, or "in memory; under systemd 64 MiB on disk";
         /// Discovery for Home Assistant: [the drives appear there](home-assistant.md) by themselves.
         home_assistant: Present = Own {
             schema: || json!({ "anyOf": [{ "const": false }, MqttHomeAssistant::schema()] }),
@@ -123,7 +123,8 @@ keys! {
         events: u8 = Number(0..=1, None), default 1;
     }
 
-    /// Where events and history are buffered while the broker is unreachable; without this table, in memory only.
+    /// Where events and history are buffered while the broker is unreachable; without this table, in memory, and
+    /// under systemd up to 64 MiB on disk.
     BUFFER: Buffer {
         /// Directory of the buffer.
         dir: PathBuf = PATH, default "/var/lib/drivegate";
