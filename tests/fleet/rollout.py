@@ -7,6 +7,7 @@ written to, and its other bus lost no cycle. `--part` names what runs; ends with
 
 import argparse
 import collections
+import grp
 import json
 import os
 import pathlib
@@ -278,6 +279,7 @@ def certificates(plant, controller, days=90):
     controller.write(base(plant))
     extra = {"drivegate_authority": str(plant.directory / "authority"), "drivegate_certificate_days": days,
              "drivegate_certificate_names": ["DNS:localhost", "IP:127.0.0.1"],
+             "drivegate_certificate_key_group": grp.getgrgid(os.getgid()).gr_name,
              "drivegate_reload_after_certificate": plant.gateways[0].process is not None}
     return controller.run("certificates.yml", "-e", json.dumps(extra))
 
