@@ -272,6 +272,27 @@ fn a_stop_reaches_its_machine_whatever_became_of_the_name() {
     }
 }
 
+/// The head of a stop of a group arrives, a reload gives the name to other drives, and the rest arrives.
+#[test]
+fn a_stop_of_a_group_reaches_the_drives_that_the_name_meant() {
+    let grouped = |one: &str, other: &str| {
+        let group = |unit: u8, group: &str| format!("unit = {unit}\ngroup = \"{group}\"");
+        controlled("pump-1", 1, &group(11, one)) + &controlled("pump-2", 2, &group(12, other))
+    };
+    let plant = Plant::new(&grouped("left", "right"));
+    for unit in [11, 12] {
+        assert_eq!(write(&mut plant.modbus(), unit, 1)[7], 6);
+    }
+    let body = "{\"group\": \"left\"}";
+    let mut stop = begin_post(&plant.site, "stop", body);
+    plant.reload(&grouped("right", "left"));
+    assert!(plant.runs(1) && plant.runs(2));
+    stop.write_all(body.as_bytes()).unwrap();
+    until("the stop", || (!plant.runs(1)).then_some(()));
+    let report = reply(&mut stop);
+    assert!(plant.runs(2), "{}", String::from_utf8_lossy(&report));
+}
+
 /// Two lines with a listener each, on which the same unit id is another drive.
 #[test]
 fn a_reload_changes_no_unit_id_that_another_listener_uses_too() {

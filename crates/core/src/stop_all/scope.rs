@@ -1,7 +1,7 @@
 //! The drives that a command to stop all includes.
 
 use crate::plant::{DriveHandle, Plant};
-use crate::process_image::Access;
+use crate::process_image::{Access, Machine};
 
 /// The drives that a command stops; only controlled ones are included.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -14,6 +14,8 @@ pub enum Scope {
     Buses(Vec<String>),
     /// All drives with this `group`.
     Group(String),
+    /// These machines, whatever their names are.
+    Machines(Vec<Machine>),
 }
 
 /// Why a command to stop all has no drives.
@@ -35,6 +37,21 @@ pub enum NothingToStop {
 }
 
 impl Scope {
+    /// The scope of a request that began when the plant was `earlier`: the name of a bus or group stands for the machines
+    /// that it meant then.
+    ///
+    /// # Errors
+    /// If the name meant no drives then.
+    pub fn as_of(self, earlier: &Plant) -> Result<Scope, NothingToStop> {
+        match self {
+            Scope::Bus(_) | Scope::Group(_) => {
+                let drives = self.drives(earlier)?;
+                Ok(Scope::Machines(drives.iter().map(DriveHandle::machine).collect()))
+            }
+            Scope::Gateway | Scope::Buses(_) | Scope::Machines(_) => Ok(self),
+        }
+    }
+
     /// The drives to stop, bus by bus.
     ///
     /// # Errors
@@ -75,6 +92,7 @@ impl Scope {
             Scope::Bus(name) => spec.bus == *name,
             Scope::Buses(names) => names.contains(&spec.bus),
             Scope::Group(name) => spec.group.as_ref() == Some(name),
+            Scope::Machines(machines) => machines.contains(&drive.machine()),
         }
     }
 }
