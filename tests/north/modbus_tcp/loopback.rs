@@ -243,7 +243,7 @@ fn of_a_write_whose_read_is_refused_only_a_stop_counts() {
     session.receive(&frame(2, 1, &words(6, &[0x8100, 5])));
     assert!(session.resets());
     session.receive(&[]);
-    // Of raw registers, too, only the stop is carried out.
+    // A raw write, too, only stops.
     let raw = write_and_read((2000, &[0, 0, 5000]), (0x9000, 1));
     assert!(session.receive(&frame(3, 1, &raw)).is_empty(), "it waits for the drive");
     assert_eq!(session.serve(), Order::Write(RequestPdu::write_register(2000, 0)));
