@@ -15,13 +15,15 @@ use drivegate_testkit::mqtt as packets;
 use super::bench::*;
 
 const SET: &str = "drivegate/hall/drive/p1/set";
+/// Size of correlation data that fill the room for results soon.
+const LONG: usize = 60_000;
 /// Receive maximum of the broker: one message at a time.
 const ONE: [u8; 3] = [0x21, 0, 1];
 
 #[derive(Default)]
 struct Seen {
     connections: usize,
-    /// Payloads of the messages, in order.
+    /// Topics and payloads of the messages, in order; long ones left out.
     messages: Vec<String>,
     withheld: Vec<[u8; 2]>,
     /// Whether the broker acknowledges messages.
@@ -106,8 +108,10 @@ impl Puppet {
 
     fn message(&self, kind: u8, body: &[u8]) {
         let mut seen = self.seen.lock().unwrap();
-        let text = String::from_utf8_lossy(body);
-        seen.messages.push(text.into_owned());
+        // Long results would be searched again and again.
+        if body.len() < LONG {
+            seen.messages.push(String::from_utf8_lossy(body).into_owned());
+        }
         if kind & 0x06 == 0 {
             return;
         }
@@ -165,7 +169,7 @@ fn more_results_than_there_is_room_for_cost_results_and_no_connection() {
     puppet.wait("/status");
     puppet.acknowledge_all(false);
     // Each result repeats the correlation data: together more than 32 MiB.
-    let refused = publish(&format!("{SET}/nothing"), &[b'c'; 60_000], "1");
+    let refused = publish(&format!("{SET}/nothing"), &[b'c'; LONG], "1");
     (0..700).for_each(|_| puppet.send(&refused));
     puppet.send(&publish(&format!("{SET}/run"), &[], "false"));
     wait_for("the stop", || (stops(&gateway) == 1).then_some(()));

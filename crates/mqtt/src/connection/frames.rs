@@ -56,10 +56,10 @@ impl PacketFrames {
     fn skip_head(&mut self, bytes: &mut &[u8]) {
         while let Some((byte, rest)) = bytes.split_first() {
             *bytes = rest;
-            let continues = HEAD_END.get(self.matched) == Some(byte);
-            self.matched = match continues {
-                true => self.matched + 1,
-                false => usize::from(HEAD_END.first() == Some(byte)),
+            self.matched = if HEAD_END.get(self.matched) == Some(byte) {
+                self.matched + 1
+            } else {
+                usize::from(HEAD_END.first() == Some(byte))
             };
             if self.matched == HEAD_END.len() {
                 (self.heads, self.matched) = (self.heads - 1, 0);

@@ -194,7 +194,11 @@ fn a_refusal_of_a_dropped_message_holds_up_no_other() {
     outbox.numbered(1).unwrap();
     assert_eq!(names(&drain(&mut outbox, 2)), ["two"]);
     outbox.push_result(long("three"));
-    assert_eq!(lost(&mut outbox, MqttKind::Result), 1, "both are in flight, the older one is dropped");
+    assert_eq!(
+        lost(&mut outbox, MqttKind::Result),
+        1,
+        "both are in flight, the older one is dropped"
+    );
     assert_eq!(outbox.put_back(1, true), None);
     outbox.acked(1);
     assert_eq!(names(&drain(&mut outbox, 2)), ["three"]);
