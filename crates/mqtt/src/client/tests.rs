@@ -1,3 +1,6 @@
+use std::fs::OpenOptions;
+use std::os::unix::fs::OpenOptionsExt as _;
+
 use arc_swap::ArcSwap;
 
 use super::super::{Broker, Buffer, Qos, Telemetry, fixture};
@@ -270,8 +273,8 @@ async fn a_password_file_that_hangs_ends_the_attempt_and_delays_no_stop() {
     let started = crate::start(options, plant, stats.clone(), cancel.clone());
     // The pipe opens for writing once somebody reads it.
     let writer = loop {
-        let flags = rustix::fs::OFlags::WRONLY | rustix::fs::OFlags::NONBLOCK;
-        match rustix::fs::open(&path, flags, rustix::fs::Mode::empty()) {
+        let waits_not = rustix::fs::OFlags::NONBLOCK.bits().cast_signed();
+        match OpenOptions::new().write(true).custom_flags(waits_not).open(&path) {
             Ok(writer) => break writer,
             Err(_) => tokio::time::sleep(Duration::from_millis(5)).await,
         }
