@@ -120,7 +120,7 @@ fn a_disk_that_hangs_holds_up_neither_start_nor_reload_nor_stop() {
     lives_with(&FILES);
 }
 
-/// A path that is a link to itself cannot be read, by nobody.
+/// A link to itself cannot be read, not even by root.
 #[test]
 fn a_drive_is_commanded_as_soon_as_the_disk_returns_its_journal() {
     for unreadable in ["params", "params/fan-2/restore.journal"] {

@@ -488,9 +488,10 @@ impl Daemon {
                 let missing: Vec<NotStopped> = missing.ok().and_then(Result::ok).unwrap_or_else(|| {
                     let stop = |d: &&DriveSpec| d.on_shutdown == OnShutdown::Stop && d.access == Access::Control;
                     let wanted = settings.drives.iter().filter(stop);
-                    let why = match task.handle().image.is_up() {
-                        true => "did not acknowledge its stop in time",
-                        false => "was not sent its stop command: its bus is down",
+                    let why = if task.handle().image.is_up() {
+                        "did not acknowledge its stop in time"
+                    } else {
+                        "was not sent its stop command: its bus is down"
                     };
                     wanted
                         .map(|d| NotStopped {

@@ -18,8 +18,8 @@ use tokio_util::sync::CancellationToken;
 const CHECK: Duration = Duration::from_millis(50);
 /// Interval of the checks whether a reload has turned `[authority]` on.
 const CHECK_AUTHORITY: Duration = Duration::from_secs(1);
-/// Time limit for the last save.
-const LAST_SAVE: Duration = Duration::from_secs(1);
+/// Time limit for the last save; shorter than the gateway waits for it, so that a failure is logged.
+const LAST_SAVE: Duration = Duration::from_millis(900);
 
 /// The file of the reservations; `None` while reservations are not kept.
 pub(super) type ReservationsFile = Arc<Mutex<Option<PathBuf>>>;
