@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use super::core::{Action, BusCore, Closed};
 use super::listener::ListenCore;
-use super::longest_transaction::longest_transaction;
+use super::longest_transaction::{longest_transaction, stops_of_all};
 use super::master::Handover;
 use super::{BusOptions, Mode};
 use drivegate_core::event::Events;
@@ -60,8 +60,9 @@ impl BusTask {
     pub fn prepare(handle: BusHandle, options: BusOptions, events: Events) -> std::io::Result<BusTask> {
         let stop = Arc::new(AtomicBool::new(false));
         let beats = Arc::new(AtomicU64::new(0));
-        let drives = handle.image.drives.iter().map(|image| &image.spec);
-        let longest = longest_transaction(&handle.image.spec, &options, drives);
+        let drives = || handle.image.drives.iter().map(|image| &image.spec);
+        let longest = longest_transaction(&handle.image.spec, &options, drives());
+        let of_all = stops_of_all(&handle.image.spec, &options, drives());
         let worker = Worker {
             handle: handle.clone(),
             options,
@@ -85,7 +86,7 @@ impl BusTask {
             stop,
             beats,
             // The transaction on the line, and the last one of a stop, which may begin at the end of the time of the stop.
-            last_stops: LAST_STOPS + 2 * longest,
+            last_stops: LAST_STOPS + 2 * longest + of_all,
             begin: Some(begin),
             thread: Some(thread),
         })

@@ -27,3 +27,17 @@ pub fn longest_transaction<'d>(
     };
     drives.map(time).max().unwrap_or_default()
 }
+
+/// Time of one stop to each of these drives, if all answer at once.
+pub(crate) fn stops_of_all<'d>(
+    spec: &BusSpec,
+    options: &BusOptions,
+    drives: impl Iterator<Item = &'d DriveSpec>,
+) -> Duration {
+    let (protocol, format) = (spec.protocol, &spec.format);
+    let wire = WireTime::of(protocol, format, &RequestPdu::write_register(0, 0));
+    let silence = protocol.silence(options.silence, format);
+    drives
+        .map(|drive| wire.total(drive.turnaround, drive.timing.silence_around(silence)))
+        .sum()
+}

@@ -113,6 +113,7 @@ impl Master {
             drive.supervision.take_over(carried.lease);
             drive.refresh.take_over(carried.repeated, now);
             drive.repeated_stops = carried.stops;
+            drive.words.take_over(carried.direction);
         }
         let sessions = match spec.protocol {
             Protocol::N2 => N2Sessions::new(images.iter().map(|d| d.spec.profile.n2)),
@@ -280,9 +281,10 @@ impl Master {
             && let Some(index) = turn.drive()
         {
             let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
-            drive.repeated_stops.sending(&image.spec.profile, &turn.pdu, now);
             if turn.pdu.is_write() && starts_motor(turn, index, drive) {
                 drive.repeated_stops.superseded();
+            } else {
+                drive.repeated_stops.sending(&image.spec.profile, &turn.pdu, now);
             }
         }
         let is_command = matches!(
@@ -345,14 +347,15 @@ impl Master {
     }
 }
 
-/// Whether the turn belongs to a command that starts the motor of this drive, perhaps by a sequence of words.
+/// Whether the turn is a step of a command that starts the motor of this drive, perhaps by a sequence of words; not the stop
+/// that follows a start that failed.
 fn starts_motor(turn: &Turn, index: DriveIndex, drive: &mut DriveState) -> bool {
     let Purpose::Command { slot, .. } = &turn.purpose else {
         return false;
     };
     drive
         .run(*slot)
-        .is_some_and(|run| run.intent().effects.on(index).starts())
+        .is_some_and(|run| run.may_write_on() && run.intent().effects.on(index).starts())
 }
 
 #[cfg(test)]

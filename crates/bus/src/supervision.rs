@@ -371,10 +371,16 @@ impl Supervision {
         let due = !waits && self.next_try.is_none_or(|at| at <= now) && reading.snapshot.link.is_online();
         match reading.spec.supervision.as_ref().map(|s| &s.action) {
             Some(LeaseAction::Stop) if due => Demand::Write(ModelPoint::Run, Value::Bool(false)),
-            Some(LeaseAction::SpeedReference(percent)) if due => Demand::Write(
-                ModelPoint::SpeedReference,
-                Value::Number(keeping_sign(*percent, reading)),
-            ),
+            Some(LeaseAction::SpeedReference(percent)) if due => {
+                // The limits may exclude a reference with that sign.
+                let is_refused = self.refused.is_some();
+                let percent = if is_refused {
+                    *percent
+                } else {
+                    keeping_sign(*percent, reading)
+                };
+                Demand::Write(ModelPoint::SpeedReference, Value::Number(percent))
+            }
             _ => Demand::None,
         }
     }
@@ -416,14 +422,11 @@ impl Supervision {
     }
 }
 
-/// The reference with the sign of the one in force: a lease that ends reverses no motor. As it is where the drive takes no such
-/// reference.
+/// The reference with the sign of the one in force: a lease that ends reverses no motor.
 fn keeping_sign(percent: f64, reading: &Reading<'_>) -> f64 {
-    let in_force = reading.model(ModelPoint::SpeedReference).good().map(Value::as_f64);
-    let index = reading.spec.profile.model_index(ModelPoint::SpeedReference);
-    let limits = index.and_then(|index| reading.spec.limits_of(index));
-    let is_taken = limits.is_none_or(|limits| limits.contains(&-percent));
-    if percent > 0.0 && is_taken && in_force.is_some_and(|percent| percent < 0.0) {
+    // The last known value counts however old it is: a drive may be back from an outage, and its reference not read yet.
+    let in_force = reading.model(ModelPoint::SpeedReference).value.map(Value::as_f64);
+    if percent > 0.0 && in_force.is_some_and(|percent| percent < 0.0) {
         -percent
     } else {
         percent

@@ -22,8 +22,8 @@ use drivegate_north::command_json::{
     HoldReply, Id, Repetition, SharedMemory, excerpt, nothing_to_stop, refuse_stop_all, refuse_unknown, stop_all,
 };
 
-/// Limits of the commands that wait for the bus. Only stops can reach them: the queues of the buses accept fewer other
-/// commands. A stop beyond them is executed, but its result is not published.
+/// Limits of the commands that wait for the bus. Beyond them only stops are taken: a stop is executed, but its result is not
+/// published.
 const WAITING: QueueLimit = QueueLimit {
     most: 4096,
     bytes: 8 << 20,
@@ -288,6 +288,9 @@ impl Commands {
     ) -> Result<(), String> {
         if id.is_none() && self.rules.require_id {
             return Err("commands need an `id` here (mqtt.require_id), except stops; nothing was written".to_string());
+        }
+        if self.waiting.is_full(WAITING) {
+            return Err("too many commands wait for the bus; nothing was written".to_string());
         }
         if crowded(reply.topic()) {
             let topic = excerpt(reply.topic().as_bytes());

@@ -3,7 +3,7 @@
 use std::io::Write as _;
 use std::net::{TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use drivegate_core::event::EventKind;
 use drivegate_core::order::{Authority, Order, Origin, SourceKind};
@@ -170,7 +170,11 @@ fn more_results_than_there_is_room_for_cost_results_and_no_connection() {
     puppet.acknowledge_all(false);
     // Each result repeats the correlation data: together more than 32 MiB.
     let refused = publish(&format!("{SET}/nothing"), &[b'c'; LONG], "1");
-    (0..700).for_each(|_| puppet.send(&refused));
+    for _ in 0..700 {
+        puppet.send(&refused);
+        // The thread that answers pings sends over the same stream.
+        std::thread::sleep(Duration::from_millis(1));
+    }
     puppet.send(&publish(&format!("{SET}/run"), &[], "false"));
     wait_for("the stop", || (stops(&gateway) == 1).then_some(()));
     let lost = || gateway.stats.mqtt.losses().map(|(_, count)| count).sum::<u64>();
@@ -206,7 +210,11 @@ fn a_packet_in_two_parts_is_as_old_as_the_first() {
     puppet.send(rest);
     puppet.acknowledge_all(true);
     let result = puppet.wait("\"id\":\"start\"");
-    assert!(result.contains("\"result\":\"purged\""), "{result}");
+    // A pause of the machine lets the start expire.
+    let is_old = ["purged", "expired"]
+        .iter()
+        .any(|why| result.contains(&format!("\"result\":\"{why}\"")));
+    assert!(is_old, "{result}");
     assert_eq!(stops(&gateway), 1);
     assert!(gateway.ordered().iter().all(|order| order.1[0].1 != Value::Bool(true)));
     gateway.stop();

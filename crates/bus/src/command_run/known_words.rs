@@ -48,10 +48,19 @@ impl KnownWords {
     /// Remembers the words of an acknowledged write.
     pub fn written(&mut self, sent: &RequestPdu) {
         self.stop = None;
-        if let RequestPdu::MaskWrite { address, .. } = sent {
+        if let RequestPdu::MaskWrite {
+            address,
+            and_mask,
+            or_mask,
+        } = sent
+        {
             // Other bits of the word may have changed since it was known.
             let place = (Table::Holding, *address);
-            self.before.extend(self.words.remove(&place).map(|word| (place, word)));
+            let masked = self
+                .words
+                .remove(&place)
+                .map(|word| word & and_mask | or_mask & !and_mask);
+            self.before.extend(masked.map(|word| (place, word)));
         }
         for (table, address, word) in written(sent).into_iter().flat_map(|(table, items)| {
             let place = move |(address, word)| (table, address, word);
@@ -135,6 +144,11 @@ impl KnownWords {
         self.waits_for_start = false;
     }
 
+    /// Continues with the direction that was ordered last on the bus before a reload.
+    pub(crate) fn take_over(&mut self, direction: Option<bool>) {
+        self.direction = direction;
+    }
+
     /// Notes the direction in which the motor turns by its command, or that this is not known.
     pub(crate) fn see_turning(&mut self, reverse: Option<bool>) {
         self.turns = reverse;
@@ -152,7 +166,8 @@ impl KnownWords {
         self.last_direction(control).or(self.turns).unwrap_or(false)
     }
 
-    fn last_direction(&self, control: &Control) -> Option<bool> {
+    /// The direction that was ordered last, for the bus that replaces this one; `None` if none was ordered.
+    pub(crate) fn last_direction(&self, control: &Control) -> Option<bool> {
         let last = |place: ControlItem| {
             let before = || self.before.get(&(place.table, place.address)).copied();
             self.get(place.table, place.address).or_else(before)

@@ -1,5 +1,6 @@
 //! What a bus that ends hands over to the next one on its line.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::Master;
@@ -10,6 +11,7 @@ use crate::refresh::Repeated;
 use crate::repeated_stops::RepeatedStops;
 use crate::supervision::Lease;
 use drivegate_core::order::{Interruption, Outcome};
+use drivegate_core::process_image::DriveImage;
 
 /// State of a drive that continues over a reload.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -20,6 +22,8 @@ pub struct CarriedState {
     pub repeated: Repeated,
     /// The stops that are to be written again.
     pub stops: RepeatedStops,
+    /// The direction that was ordered last, `true` for reverse.
+    pub direction: Option<bool>,
 }
 
 impl CarriedState {
@@ -77,15 +81,17 @@ impl Master {
                 drive.supervision.renew(at);
             }
         }
-        let close = |drive: &mut DriveState| {
+        let close = |(drive, image): (&mut DriveState, &Arc<DriveImage>)| {
             drive.close(&Outcome::ShuttingDown, Interruption::ShuttingDown, now);
+            let control = image.spec.profile.control.as_ref();
             CarriedState {
                 lease: drive.supervision.lease(),
                 repeated: drive.refresh.handed_over(),
                 stops: drive.repeated_stops,
+                direction: control.and_then(|control| drive.words.last_direction(control)),
             }
         };
-        let leases = self.drives.iter_mut().map(close).collect();
+        let leases = self.drives.iter_mut().zip(&self.bus.image.drives).map(close).collect();
         self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
         let late = self
             .drives

@@ -333,16 +333,24 @@ fn every_family_is_written_its_action() {
 
 #[test]
 fn a_reference_of_the_action_keeps_the_direction_of_a_signed_reference() {
-    for (in_force, limit, expected) in [(-40.0, -100.0, -20.0), (40.0, -100.0, 20.0), (-40.0, 0.0, 20.0)] {
+    for (in_force, age_ms, limit, expected) in [
+        (-40.0, 0, -100.0, -20.0),
+        (40.0, 0, -100.0, 20.0),
+        (-40.0, 5_900, -100.0, -20.0),
+        (-40.0, 0, 0.0, 20.0),
+    ] {
         let profile = drivegate_testkit::profile("danfoss-fc");
         let mut rig = SupervisedDrive::of(&profile, LeaseAction::SpeedReference(20.0));
         let mut spec = rig.spec();
         spec.limits.insert("speed_reference".to_string(), limit..=100.0);
         rig.reload(spec);
         rig.heartbeat();
-        rig.now += Duration::from_millis(5_900);
+        rig.now += Duration::from_millis(5_900 - age_ms);
         rig.shows(ModelPoint::SpeedReference, Value::Number(in_force));
-        let command = rig.after(100, true).expect("the action");
+        rig.now += Duration::from_millis(age_ms);
+        // Limits that exclude the sign refuse the first try.
+        let first = rig.after(100, true);
+        let command = first.or_else(|| rig.after(1_000, true)).expect("the action");
         let sets = writes(&profile, command, rig.now);
         let written = sets
             .iter()
@@ -350,7 +358,7 @@ fn a_reference_of_the_action_keeps_the_direction_of_a_signed_reference() {
             .map(|(_, value)| value.as_f64());
         assert!(
             written.is_some_and(|value| (value - expected).abs() < 0.02),
-            "{in_force}: {sets:?}"
+            "{in_force}, {age_ms} ms: {sets:?}"
         );
     }
 }

@@ -130,12 +130,13 @@ impl Leases {
             }
             let left = self.left.remove(&machine);
             if drive.supervision.is_none() {
-                let stops = left.as_ref().map(|left| left.carried.stops);
+                let kept = left.as_ref().map(|left| (left.carried.stops, left.carried.direction));
                 // The time of the lease does not run until a configuration supervises the drive again.
                 self.parted
                     .extend(left.map(|left| (machine, (now, left.carried.alone()))));
-                return stops.map(|stops| CarriedState {
+                return kept.map(|(stops, direction)| CarriedState {
                     stops,
+                    direction,
                     ..CarriedState::default()
                 });
             }

@@ -68,6 +68,11 @@ pub(super) struct Saver {
 impl Saver {
     /// Writes the reservations whenever they change.
     pub(super) fn start(plant: SharedPlant, file: ReservationsFile, awaited: Arc<AwaitedFiles>) -> Saver {
+        Saver::with_limit(plant, file, awaited, LAST_SAVE)
+    }
+
+    /// As [`Saver::start`]; the last save may take `limit`.
+    fn with_limit(plant: SharedPlant, file: ReservationsFile, awaited: Arc<AwaitedFiles>, limit: Duration) -> Saver {
         let end = CancellationToken::new();
         let ended = end.clone();
         let task = tokio::spawn(async move {
@@ -81,12 +86,12 @@ impl Saver {
             while tokio::time::timeout(pause(&plant), ended.cancelled()).await.is_err() {
                 save(&mut saved);
             }
-            let until = tokio::time::Instant::now() + LAST_SAVE;
+            let until = tokio::time::Instant::now() + limit;
+            // A write that is in progress may fail, and lacks what was reserved since it began.
+            let _ = saved.settled(until).await;
+            save(&mut saved);
             if saved.settled(until).await {
-                save(&mut saved);
-                if saved.settled(until).await {
-                    return;
-                }
+                return;
             }
             tracing::error!(
                 target: "drivegate::daemon",
@@ -151,7 +156,8 @@ mod tests {
         online(&drive.image);
         let file = ReservationsFile::default();
         keep_in(&file, Some(folder.path()));
-        let mut saver = Saver::start(Arc::new(arc_swap::ArcSwap::from_pointee(plant)), file, Arc::default());
+        let plant = Arc::new(arc_swap::ArcSwap::from_pointee(plant));
+        let mut saver = Saver::with_limit(plant, file, Arc::default(), Duration::from_secs(60));
         tokio::task::yield_now().await;
         let run = drive.image.spec.profile.model_index(ModelPoint::Run).unwrap();
         let order = Order::Points(vec![(run, Value::Bool(false))]);

@@ -19,9 +19,11 @@ const BATCH: usize = 1024;
 /// Time after which messages on disk survive a power failure.
 const SYNC: Duration = Duration::from_secs(1);
 /// Attempts to lock the directory, and the wait between them: a process that is stopping may still have it locked. The
-/// client before a reload is waited for without a limit.
+/// client before a reload is waited for longer.
 pub(super) const LOCK_ATTEMPTS: u32 = 20;
 pub(super) const LOCK_WAIT: Duration = Duration::from_millis(50);
+/// Attempts while the client before a reload still writes: a minute, in which new messages wait for the buffer.
+const WRITTEN_ATTEMPTS: u32 = 1200;
 
 /// The thread that owns the files.
 pub(super) struct Thread {
@@ -178,7 +180,13 @@ fn open_log(buffer: &Buffer, name: &'static str, before: &[Writer]) -> Option<Me
     let mut attempts = 0;
     loop {
         // A writer unlocks the log before it ends, so the attempt after its end finds no lock of it.
-        let is_written = before.iter().any(Writer::is_running);
+        let is_written = attempts < WRITTEN_ATTEMPTS && before.iter().any(Writer::is_running);
+        if is_written && attempts >= LOCK_ATTEMPTS {
+            // All of them come first, in whatever order they end.
+            attempts += 1;
+            std::thread::sleep(LOCK_WAIT);
+            continue;
+        }
         match MessageLog::open(&buffer.dir, name, buffer.max_bytes) {
             Ok(log) => return Some(log),
             Err(error) if error.kind() == io::ErrorKind::WouldBlock && (is_written || attempts < LOCK_ATTEMPTS) => {

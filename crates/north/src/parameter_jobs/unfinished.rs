@@ -214,10 +214,14 @@ pub async fn hold_unfinished<'a>(
         locks_some = true;
     }
     let (done, looked) = oneshot::channel();
+    // Closed when the gateway has ended.
+    let (ended, gateway) = oneshot::channel::<()>();
+    tokio::spawn(gateway);
     spawn_blocking(move || {
-        search.insist(store.dir(), || !done.is_closed());
-        // The receiver may have ended meanwhile.
-        done.send(())
+        let first = search.look(store.dir());
+        // The receiver does not wait for ever.
+        let _ = done.send(());
+        search.insist(store.dir(), first, || !ended.is_closed());
     });
     if patience.wait(looked).await.is_none() {
         let meanwhile = if locks_some {
@@ -246,10 +250,10 @@ impl Search {
         self.drives.iter().filter(|drive| self.vault.is_new(&drive.machine))
     }
 
-    /// Looks for journals, and again while the disk refuses, as long as `goes_on` and no later search has begun.
-    fn insist(&self, params: &Path, goes_on: impl Fn() -> bool) {
+    /// Looks for journals again while the disk refuses, as long as `goes_on` and no later search has begun.
+    fn insist(&self, params: &Path, mut found: Result<(), String>, goes_on: impl Fn() -> bool) {
         let mut failing = false;
-        while let Err(why) = self.look(params) {
+        while let Err(why) = found {
             if !std::mem::replace(&mut failing, true) {
                 tracing::error!(
                     target: "drivegate::north::parameter_jobs",
@@ -264,8 +268,9 @@ impl Search {
             if !goes_on() || !self.vault.is_last_search(self.number) {
                 return;
             }
+            found = self.look(params);
         }
-        if failing {
+        if failing && self.vault.is_last_search(self.number) {
             tracing::warn!(target: "drivegate::north::parameter_jobs", "the journals of restores are read");
         }
     }

@@ -218,3 +218,102 @@ fn a_stop_is_not_sent_again_into_a_start_by_a_sequence() {
         assert!(rig.drives[0].family.as_ref().unwrap().runs, "{family}");
     }
 }
+
+/// The last word of a start gets no reply, so a stop follows; the word may arrive later, and the stop is sent again behind it.
+#[test]
+fn the_stop_behind_a_start_that_failed_is_sent_again() {
+    for family in ["abb-acs580", "siemens-g120", "schneider-altivar"] {
+        let line = BusSpec {
+            port: "modbus-tcp://10.0.0.1:502".to_string(),
+            cycle: Duration::from_millis(10),
+            ..bus_spec("b")
+        };
+        let mut rig = Rig::on(line, 1, family, |spec| DriveSpec {
+            supervision: None,
+            ..spec
+        });
+        let profile = drivegate_testkit::profile(family);
+        rig.drives[0].family = Some(FamilyDrive::new(&profile));
+        rig.run(Duration::from_secs(5));
+        let control = profile.control.as_ref().unwrap();
+        let is_run = |turn: &Turn| {
+            let items = drivegate_core::order::written(turn.pdu())
+                .map(|(_, items)| items)
+                .unwrap_or_default();
+            items.iter().any(|(_, word)| control.is_run(control.at, *word))
+        };
+        let is_stop = |turn: &Turn| turn.pdu().is_write() && !is_run(turn);
+        let from = rig.wire.len();
+        let mut start = rig.switch(0, "a", true);
+        // The motor does not run yet, and nothing of the drive is heard, when the last word is sent.
+        while outcome(&mut start).is_none() {
+            let tries = rig.wire[from..].iter().filter(|(_, turn)| is_run(turn)).count();
+            let first_words = rig.wire[from..].iter().filter(|(_, turn)| is_stop(turn)).count();
+            let last_is_next = first_words >= control_steps(control) - 1;
+            rig.drives[0].next_write = (last_is_next && tries < 2).then_some(Ended::Silent);
+            rig.step();
+            assert!(rig.wire.len() < from + 3000, "{family}: no answer");
+        }
+        rig.drives[0].next_write = None;
+        let stopped = rig.now;
+        rig.run(Duration::from_secs(5));
+        let again = rig
+            .wire
+            .iter()
+            .filter(|(at, turn)| *at > stopped && is_stop(turn))
+            .count();
+        assert_eq!(again, 2, "{family}");
+    }
+}
+
+fn control_steps(control: &drivegate_model::drive::control::Control) -> usize {
+    match &control.run {
+        drivegate_model::drive::control::Run::Steps(steps) => steps.len(),
+        _ => 1,
+    }
+}
+
+/// A reload ends the bus and begins another one, which knows no word of the drive.
+#[test]
+fn a_reload_keeps_the_direction_of_a_run_command_that_names_none() {
+    for (family, back) in [("danfoss-fc", 0x847C), ("weg-cfw", 0x0013), ("fuji-frenic", 0x0002)] {
+        let cycle = Duration::from_millis(10);
+        let mut rig = Rig::empty(1, family, Protocol::ModbusRtu, cycle, |spec| DriveSpec {
+            supervision: None,
+            ..spec
+        });
+        rig.drives[0].family = Some(FamilyDrive::new(&drivegate_testkit::profile(family)));
+        rig.run(Duration::from_secs(5));
+        let points = |names: &[ModelPoint]| {
+            let profile = &rig.bus.image.drives[0].spec.profile;
+            let value = |point: &ModelPoint| (profile.model_index(*point).unwrap(), Value::Bool(true));
+            Order::Points(names.iter().map(value).collect())
+        };
+        for (order, reloads) in [
+            (points(&[ModelPoint::Run, ModelPoint::Reverse]), true),
+            (points(&[ModelPoint::Run]), false),
+        ] {
+            let origin = Origin::new(SourceKind::Mqtt, "a");
+            let window = window(rig.now, DEFAULT_EXPIRY);
+            let mut answer = submit(&rig.bus, DriveIndex::new(0), origin, order, window, rig.now);
+            let from = rig.wire.len();
+            for _ in 0..200 {
+                rig.step();
+            }
+            let words = rig.wire[from..]
+                .iter()
+                .filter_map(|(_, turn)| drivegate_core::order::written(turn.pdu()));
+            let words: Vec<u16> = words.flat_map(|(_, items)| items).map(|(_, word)| word).collect();
+            let outcome = outcome(&mut answer);
+            assert!(
+                words.contains(&back),
+                "{family}, reload={reloads}: {words:04X?}, {outcome:?}"
+            );
+            if reloads {
+                let handover = rig.master.ended(None, rig.now);
+                rig.begin_anew(&handover);
+                rig.run(Duration::from_secs(2));
+            }
+        }
+    }
+}

@@ -1,6 +1,7 @@
 //! Whether a file of an earlier run that may forbid the start is not read yet, as on a disk that hangs.
 //!
-//! The rule is checked only when an order is accepted: these files are read once, and no order is accepted before that begins.
+//! A start is judged when it is accepted: these files are read once, and no order is accepted before that begins. The write shows
+//! more: only then is it known that a reference may turn a motor whose run command the drive does not show.
 
 use crate::order::{Asks, Holder, Refusal};
 use crate::permit::Mode;
@@ -8,7 +9,7 @@ use crate::permit::gate::{DriveGate, Gate};
 use crate::permit::judge::{Ask, Rule, Stage, Verdict};
 
 pub(in crate::permit) const RULE: Rule = Rule {
-    stages: &[Stage::Accept],
+    stages: &[Stage::Accept, Stage::Write],
     binds_stops: false,
     judge,
 };
@@ -60,24 +61,30 @@ mod tests {
         let (advisory, exclusive) = (Some(Mode::Advisory), Some(Mode::Exclusive));
         // The file that is not read yet, the mode of `[authority]`, the client, its order, and what becomes of that.
         let table = [
-            ("none", exclusive, Http, "start", "go - -"),
-            ("slots", None, Http, "start", "held_by_other - -"),
-            ("slots", None, ModbusTcp, "start", "held_by_other - -"),
-            ("slots", None, Bacnet, "start", "held_by_other - -"),
-            ("slots", exclusive, Http, "start", "held_by_other - -"),
-            ("slots", None, Supervision, "start", "go - -"),
+            ("none", exclusive, Http, "start", "go - go"),
+            ("slots", None, Http, "start", "held_by_other - held_by_other"),
+            ("slots", None, ModbusTcp, "start", "held_by_other - held_by_other"),
+            ("slots", None, Bacnet, "start", "held_by_other - held_by_other"),
+            ("slots", exclusive, Http, "start", "held_by_other - held_by_other"),
+            ("slots", None, Supervision, "start", "go - go"),
             ("slots", None, Interlock, "stop", "- - -"),
-            ("slots", None, Http, "reference", "go - -"),
-            ("slots", None, Http, "reset", "go - -"),
+            ("slots", None, Http, "reference", "go - held_by_other"),
+            ("slots", None, Http, "reset", "go - go"),
             ("slots", None, Http, "stop", "- - -"),
-            ("slots", None, Http, "read", "go - -"),
-            ("slots, read since", None, Http, "start", "go - -"),
-            ("reservations", None, Http, "start", "go - -"),
-            ("reservations", advisory, Http, "start", "go - -"),
-            ("reservations", exclusive, Http, "start", "held_by_other - -"),
-            ("reservations", exclusive, Http, "reference", "go - -"),
+            ("slots", None, Http, "read", "go - go"),
+            ("slots, read since", None, Http, "start", "go - go"),
+            ("reservations", None, Http, "start", "go - go"),
+            ("reservations", advisory, Http, "start", "go - go"),
+            (
+                "reservations",
+                exclusive,
+                Http,
+                "start",
+                "held_by_other - held_by_other",
+            ),
+            ("reservations", exclusive, Http, "reference", "go - held_by_other"),
             ("reservations", exclusive, Http, "stop", "- - -"),
-            ("reservations, read since", exclusive, Http, "start", "go - -"),
+            ("reservations, read since", exclusive, Http, "start", "go - go"),
         ];
         for (file, mode, kind, order, expected) in table {
             let mut trial = Trial::new();
@@ -107,9 +114,9 @@ mod tests {
         trial.gate.set_awaited(Arc::new(files));
         let client = Origin::new(SourceKind::Http, "c");
         for (process_data, expected) in [
-            (&[0x03, 0, 0, 0][..], "held_by_other - -"),
-            (RUNS, "go - -"),
-            (STANDS, "go - -"),
+            (&[0x03, 0, 0, 0][..], "held_by_other - held_by_other"),
+            (RUNS, "go - go"),
+            (STANDS, "go - held_by_other"),
         ] {
             read(&trial.image, 2100, process_data, trial.now);
             assert_eq!(
