@@ -292,7 +292,7 @@ fn each_rule_is_asked_at_its_moments_and_of_its_orders() {
                 "reset: held_by_other held_by_other held_by_other",
             ],
         ),
-        (Why::FileAwaited, &["start: held_by_other - -"]),
+        (Why::FileAwaited, &["start: held_by_other - held_by_other"]),
         (Why::Protected, &["start: held_by_other held_by_other held_by_other"]),
         (
             Why::Drill,
@@ -378,7 +378,7 @@ fn a_reference_that_turns_the_motor_is_a_start() {
 
 #[test]
 fn a_reservation_that_is_not_read_yet_forbids_starts_where_drives_are_held() {
-    for (has_authority, expected) in [(false, &[][..]), (true, &["start: held_by_other - -"][..])] {
+    for (has_authority, expected) in [(false, &[][..]), (true, &["start: held_by_other - held_by_other"][..])] {
         let row = |what: &&str| {
             let told = [Stage::Accept, Stage::Turn, Stage::Write].map(|stage| {
                 let mut rig = Rig::new(Why::Nothing);
