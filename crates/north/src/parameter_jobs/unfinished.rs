@@ -218,7 +218,7 @@ pub async fn hold_unfinished<'a>(
     let (ended, gateway) = oneshot::channel::<()>();
     tokio::spawn(gateway);
     spawn_blocking(move || {
-        let first = search.look(store.dir());
+        let first = search.read_journals(store.dir());
         // The receiver does not wait for ever.
         let _ = done.send(());
         search.insist(store.dir(), first, || !ended.is_closed());
@@ -268,7 +268,7 @@ impl Search {
             if !goes_on() || !self.vault.is_last_search(self.number) {
                 return;
             }
-            found = self.look(params);
+            found = self.read_journals(params);
         }
         if failing && self.vault.is_last_search(self.number) {
             tracing::warn!(target: "drivegate::north::parameter_jobs", "the journals of restores are read");
@@ -279,7 +279,7 @@ impl Search {
     ///
     /// # Errors
     /// If the disk does not return all journals; contains the reason. The drives that an unread one concerns stay new.
-    fn look(&self, params: &Path) -> Result<(), String> {
+    fn read_journals(&self, params: &Path) -> Result<(), String> {
         let Search { vault, events, .. } = self;
         let journals = found(params).map_err(|error| format!("{}: {error}", params.display()))?;
         let unread: Vec<Option<String>> = journals.iter().map(|(file, _)| error_of(file)).collect();
