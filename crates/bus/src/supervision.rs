@@ -373,7 +373,7 @@ impl Supervision {
             Some(LeaseAction::Stop) if due => Demand::Write(ModelPoint::Run, Value::Bool(false)),
             Some(LeaseAction::SpeedReference(percent)) if due => {
                 // The limits may exclude a reference with that sign.
-                let is_refused = self.refused.is_some();
+                let is_refused = matches!(self.refused, Some(Refusal::BadValue(_)));
                 let percent = if is_refused {
                     *percent
                 } else {

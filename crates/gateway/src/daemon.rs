@@ -283,14 +283,22 @@ impl Daemon {
         let mut learned: BTreeMap<String, Learned> = BTreeMap::new();
         self.watch(&kept);
         let stopped: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
-        let leaving = stopped.iter().flat_map(|bus| bus.image.drives.iter().cloned());
-        self.guards.expect(&leaving.collect::<Vec<_>>(), Instant::now());
         let removed = removed.into_iter().map(|(bus, task)| {
             let last = unserved(task.handle(), settings);
             (bus, (task, last))
         });
+        // Last stops to silent drives may take seconds, in which the other buses go on.
+        let (with_stops, others): (Vec<_>, Vec<_>) = removed.partition(|(_, (_, last))| !last.is_empty());
         let make_room = |(task, last): (BusTask, Vec<DriveIndex>)| task.make_room(last);
-        for (before, left) in at_once(removed.collect(), make_room).await {
+        let mut ended = Vec::new();
+        for buses in [with_stops, others] {
+            let leaving = buses
+                .iter()
+                .flat_map(|(_, (task, _))| task.handle().image.drives.iter().cloned());
+            self.guards.expect(&leaving.collect::<Vec<_>>(), Instant::now());
+            ended.extend(at_once(buses, make_room).await);
+        }
+        for (before, left) in ended {
             learned.extend(left.learned.map(|learned| (before.spec.port.clone(), learned)));
             leases.left(&before, left.leases);
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));

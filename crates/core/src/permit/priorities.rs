@@ -353,7 +353,9 @@ impl Priorities {
             self.ask(write);
             return;
         }
-        if origin.kind == SourceKind::Bacnet || self.arrays.is_none() {
+        // A stop of BACnet without a slot was meant for the machine that had the device number before a reload.
+        let is_of_slots = origin.kind == SourceKind::Bacnet && effect.run != Some(false);
+        if is_of_slots || self.arrays.is_none() {
             return;
         }
         if origin.kind == SourceKind::Supervision {

@@ -89,9 +89,12 @@ impl Saver {
             let until = tokio::time::Instant::now() + limit;
             // A write that is in progress may fail, and lacks what was reserved since it began.
             let _ = saved.settled(until).await;
-            save(&mut saved);
-            if saved.settled(until).await {
-                return;
+            // A write that the disk still holds up must not meet a second one in the same file.
+            if tokio::time::Instant::now() < until {
+                save(&mut saved);
+                if saved.settled(until).await {
+                    return;
+                }
             }
             tracing::error!(
                 target: "drivegate::daemon",

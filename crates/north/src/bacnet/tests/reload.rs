@@ -170,6 +170,9 @@ fn what_arrives_behind_a_reload_reaches_the_machine_that_the_number_means_now() 
 #[test]
 fn what_arrived_before_a_reload_reaches_the_machine_that_it_named_and_no_slot() {
     let mut plant = Reloads::new();
+    plant.run_at_8(1, true);
+    assert_eq!(plant.next(&done()), Some((1, true)));
+    plant.server.collect(plant.now);
     let before = plant.now;
     plant.reload(&[2, 1]);
     plant.protect("p2");
@@ -184,7 +187,10 @@ fn what_arrived_before_a_reload_reaches_the_machine_that_it_named_and_no_slot() 
         };
         assert_eq!(plant.carried_out(), Some((1, false)), "{stop:?}");
         assert_eq!(waiting.slot, None);
-        assert!(!slots(&plant, "p1") && !slots(&plant, "p2"));
+        assert!(
+            !slots(&plant, "p1") && !slots(&plant, "p2"),
+            "an active would start the motor later"
+        );
     }
     let denied = |begun| matches!(begun, JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED)));
     assert!(denied(plant.begun(Some(true), before)));
