@@ -539,7 +539,7 @@ impl Daemon {
     }
 }
 
-/// Stops buses simultaneously and outside the runtime, because each takes up to a second. Returns the state that
+/// Stops buses simultaneously and outside the runtime, because each may take seconds. Returns the state that
 /// the buses hand over.
 async fn at_once<B: Send + 'static, T: Send + 'static>(
     buses: Vec<(BusSettings, B)>,

@@ -180,21 +180,27 @@ fn a_stop_to_an_n2_drive_that_cannot_be_identified_is_answered_and_leaves_the_li
     assert_eq!(outcome(&mut stop), Some(Outcome::TimedOut));
 }
 
+/// A drive of this family behind a Modbus TCP gateway, which has been polled for some seconds.
+fn behind_a_network(family: &str) -> Rig {
+    let line = BusSpec {
+        port: "modbus-tcp://10.0.0.1:502".to_string(),
+        cycle: Duration::from_millis(10),
+        ..bus_spec("b")
+    };
+    let mut rig = Rig::on(line, 1, family, |spec| DriveSpec {
+        supervision: None,
+        ..spec
+    });
+    rig.drives[0].family = Some(FamilyDrive::new(&drivegate_testkit::profile(family)));
+    rig.run(Duration::from_secs(5));
+    rig
+}
+
 /// A network may deliver an unanswered write late, so the stop behind it is sent again; not into a start that has begun since.
 #[test]
 fn a_stop_is_not_sent_again_into_a_start_by_a_sequence() {
     for family in ["abb-acs580", "siemens-g120", "schneider-altivar"] {
-        let line = BusSpec {
-            port: "modbus-tcp://10.0.0.1:502".to_string(),
-            cycle: Duration::from_millis(10),
-            ..bus_spec("b")
-        };
-        let mut rig = Rig::on(line, 1, family, |spec| DriveSpec {
-            supervision: None,
-            ..spec
-        });
-        rig.drives[0].family = Some(FamilyDrive::new(&drivegate_testkit::profile(family)));
-        rig.run(Duration::from_secs(5));
+        let mut rig = behind_a_network(family);
         rig.drives[0].next_write = Some(Ended::Silent);
         rig.order(0, "a", ModelPoint::SpeedReference, Value::Number(30.0));
         rig.run(Duration::from_millis(300));
@@ -223,18 +229,8 @@ fn a_stop_is_not_sent_again_into_a_start_by_a_sequence() {
 #[test]
 fn the_stop_behind_a_start_that_failed_is_sent_again() {
     for family in ["abb-acs580", "siemens-g120", "schneider-altivar"] {
-        let line = BusSpec {
-            port: "modbus-tcp://10.0.0.1:502".to_string(),
-            cycle: Duration::from_millis(10),
-            ..bus_spec("b")
-        };
-        let mut rig = Rig::on(line, 1, family, |spec| DriveSpec {
-            supervision: None,
-            ..spec
-        });
+        let mut rig = behind_a_network(family);
         let profile = drivegate_testkit::profile(family);
-        rig.drives[0].family = Some(FamilyDrive::new(&profile));
-        rig.run(Duration::from_secs(5));
         let control = profile.control.as_ref().unwrap();
         let is_run = |turn: &Turn| {
             let items = drivegate_core::order::written(turn.pdu())
