@@ -125,6 +125,8 @@ fn starts_are_refused_and_wait_and_stops_pass() {
         get(site.http, "/api/v1/drives/pump-9").filter(|(status, _)| *status == 200)
     });
     site.until_state("pump-9", "ready");
+    // The interlock needs fan-2, which the bus of the new configuration reads only after pump-9.
+    site.until_point("fan-2", "running", true);
     let (status, answer) = curl(&site, "pump-9", "{\"run\": true}");
     assert!(
         status == 409 && answer["retry_after_ms"].as_u64() > Some(60_000),
