@@ -258,6 +258,7 @@ impl Master {
 
     /// Notes that the turn is sent at `now`.
     pub fn sending(&mut self, turn: &Turn, now: Instant) -> Sending {
+        self.turns.sent();
         if let Purpose::Command {
             drive: index,
             slot,

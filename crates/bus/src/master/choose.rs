@@ -25,6 +25,17 @@ const MOST_DECISIONS: usize = 1000;
 pub(super) struct Turns {
     in_a_row: PerRank<u32>,
     queued_first: PerRank<u32>,
+    chosen: Option<ChosenTurn>,
+}
+
+/// The turn of a command that was chosen and is not sent yet. A request that arrives in the silence before the frame may
+/// take its place, so the turn counts once it is sent.
+#[derive(Debug, Clone, Copy)]
+struct ChosenTurn {
+    rank: Urgency,
+    lower_waits: bool,
+    /// Whether the command repeats a step for which its drive was too busy.
+    repetition: bool,
 }
 
 impl Turns {
@@ -47,14 +58,23 @@ impl Turns {
         let begins = repetition && *first < if queued.is_last { 1 } else { IN_A_ROW };
         if begins {
             *first += 1;
-        } else if repetition {
-            *first = 0;
         }
         begins
     }
 
-    /// Counts a transaction of this rank, with lower ranks waiting or not.
-    fn served(&mut self, rank: Urgency, lower_waits: bool) {
+    /// Counts the chosen turn of a command: its frame is sent.
+    pub(super) fn sent(&mut self) {
+        let Some(ChosenTurn {
+            rank,
+            lower_waits,
+            repetition,
+        }) = self.chosen.take()
+        else {
+            return;
+        };
+        if repetition {
+            *self.queued_first.of_mut(rank) = 0;
+        }
         for (of, count) in RANKS.into_iter().zip(self.in_a_row.iter_mut()) {
             if of < rank {
                 *count = 0;
@@ -130,6 +150,7 @@ impl Master {
 
     /// Makes one decision.
     fn decide(&mut self, now: Instant) -> Decided {
+        self.turns.chosen = None;
         self.purge(now);
         let quiet = self.bus.queue.quiet(now);
         if quiet != self.waits.quiet {
@@ -151,7 +172,11 @@ impl Master {
             && !commands.waits(Urgency::Stop)
             && let Some(ready) = self.checked_write(now)
         {
-            self.turns.served(Urgency::Command, commands.waits(Urgency::Read));
+            self.turns.chosen = Some(ChosenTurn {
+                rank: Urgency::Command,
+                lower_waits: commands.waits(Urgency::Read),
+                repetition: false,
+            });
             return Decided::Send(self.turn(ready, now));
         }
         if !commands.waits(Urgency::Stop)
@@ -317,11 +342,15 @@ impl Master {
         let lower_waits = RANKS.into_iter().any(|lower| lower > rank && commands.waits(lower));
         let ready = commands.ready.of_mut(rank).take();
         let queued = *commands.queued.of(rank);
-        let begins = |turns: &mut Turns, ready: &NextStep| {
-            queued.is_some_and(|queued| turns.begins_before(ready.repeats_since.is_some(), queued))
+        let repetition = ready.as_ref().is_some_and(|ready| ready.repeats_since.is_some());
+        let counted = ChosenTurn {
+            rank,
+            lower_waits,
+            repetition,
         };
-        if let Some(ready) = ready.filter(|ready| !begins(&mut self.turns, ready)) {
-            self.turns.served(rank, lower_waits);
+        let begins = |turns: &mut Turns| queued.is_some_and(|queued| turns.begins_before(repetition, queued));
+        if let Some(ready) = ready.filter(|_| !begins(&mut self.turns)) {
+            self.turns.chosen = Some(counted);
             return Decided::Send(self.turn(ready, now));
         }
         let Some(chosen) = queued else {
@@ -331,7 +360,10 @@ impl Master {
             return Decided::Again;
         };
         if command.as_passed_on().is_some() {
-            self.turns.served(rank, lower_waits);
+            self.turns.chosen = Some(ChosenTurn {
+                repetition: false,
+                ..counted
+            });
             return self.begin_passed_on(command, None, now).into();
         }
         self.begin(command, chosen.rank, now);

@@ -74,3 +74,32 @@ fn an_action_goes_out_though_an_order_waits_whose_time_is_over() {
     rig.now = at;
     assert!(rig.master.is_still_due(&action, rig.now));
 }
+
+/// A client stops a motor again as soon as its last stop is answered, always while the line falls silent before the frame of
+/// another client: that frame goes out behind eight stops in a row.
+#[test]
+fn a_stop_in_each_silence_keeps_no_command_waiting() {
+    let mut rig = Rig::at(2, "vacon-nx", Protocol::ModbusRtu, Duration::from_secs(1));
+    let mut reference = rig.order(1, "other", ModelPoint::SpeedReference, Value::Number(30.0));
+    let mut stop = rig.switch(0, "client", false);
+    let mut stops = 0;
+    while outcome(&mut reference).is_none() && stops < 20 {
+        let mut news = Vec::new();
+        match rig.master.next(rig.now, &mut news) {
+            Err(until) => rig.now = until,
+            Ok(turn) if turn.rank() != Some(Urgency::Stop) && outcome(&mut stop).is_some() => {
+                // The motor runs again meanwhile, so the stop goes before everything.
+                rig.drives[0].holding.insert(2000, 1);
+                stop = rig.switch(0, "client", false);
+            }
+            Ok(turn) => {
+                stops += usize::from(turn.rank() == Some(Urgency::Stop));
+                rig.carry_out(turn, &mut news);
+            }
+        }
+        for one in &news {
+            rig.apply(one);
+        }
+    }
+    assert!((8..=9).contains(&stops), "{stops} stops before the reference");
+}
