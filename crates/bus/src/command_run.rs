@@ -17,12 +17,13 @@ mod word;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-pub use self::known_words::KnownWords;
+pub use self::known_words::{KnownWords, OrderedDirection};
 pub(crate) use self::state_read::StateRead;
 pub use self::steps::{Step, StepPurpose};
 pub use self::word::read_place;
 
 use self::next_direction::NextDirection;
+pub(crate) use self::next_direction::names_no_direction;
 use self::parameter::ParameterRun;
 use self::steps::{
     Action, Check, Permit, RequestContext, actions, names_run, sets_all_bits, unsendable, write_on_change,

@@ -15,7 +15,7 @@ use drivegate_core::order::{Command, Interruption, Order, Origin, Outcome, Urgen
 use drivegate_core::permit::LastWritten;
 use drivegate_core::process_image::{Access, DriveImage, DriveSpec, Reading};
 use drivegate_model::drive::control::Control;
-use drivegate_model::drive::{ModelPoint, Point, Profile};
+use drivegate_model::drive::{DriveIndex, ModelPoint, Point, Profile};
 use drivegate_proto::{Reply, Table};
 
 /// A status older than this, or than three rounds of the line, does not show whether the motor runs.
@@ -128,6 +128,13 @@ impl DriveState {
     /// Whether a command of that rank has started.
     pub(super) fn is_busy(&self, urgency: Urgency) -> bool {
         self.runs.of(urgency).is_some()
+    }
+
+    /// Whether a command has begun to start the motor of this drive, perhaps by a sequence of words; not the stop that follows
+    /// a start that failed.
+    pub(super) fn is_starting(&self, index: DriveIndex) -> bool {
+        let run = self.runs.command.as_ref();
+        run.is_some_and(|run| run.has_begun() && run.may_write_on() && run.intent().effects.on(index).starts())
     }
 
     /// Whether any command has started.

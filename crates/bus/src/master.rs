@@ -6,6 +6,7 @@
 //! background transactions in `background`, leases in `lease`; the end of a bus is in `handover`, that of the gateway in
 //! `shutdown`.
 
+mod awaited_direction;
 mod background;
 mod choose;
 mod handover;
@@ -209,7 +210,9 @@ impl Master {
             if image.spec.supervision.is_some() {
                 supervise(bus, index, image, drive, now, news);
             }
-            if drive.repeated_stops.take_due(now) {
+            // Between the writes of a start, a stop would stop what a client has just ordered. If the start ends before its
+            // run command, the stop goes then.
+            if !drive.is_starting(index) && drive.repeated_stops.take_due(now) {
                 let origin = Origin::new(SourceKind::Schedule, Origin::REPEATED_STOP);
                 let stop = (ModelPoint::Run, Value::Bool(false));
                 let ordered = bus.own_order(index, &image.reading(now, drive.fresh), stop, origin, DEFAULT_EXPIRY);
@@ -282,11 +285,16 @@ impl Master {
             && let Some(index) = turn.drive()
         {
             let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
-            if turn.pdu.is_write() && starts_motor(turn, index, drive) {
-                drive.repeated_stops.superseded();
-            } else {
-                drive.repeated_stops.sending(&image.spec.profile, &turn.pdu, now);
-            }
+            let of_start = matches!(
+                turn.purpose,
+                Purpose::Command {
+                    slot: Urgency::Command,
+                    ..
+                }
+            ) && drive.is_starting(index);
+            drive
+                .repeated_stops
+                .sending(&image.spec.profile, &turn.pdu, of_start, now);
         }
         let is_command = matches!(
             turn.purpose,
@@ -346,17 +354,6 @@ impl Master {
     pub(crate) fn n2_late(&mut self) -> &mut N2LateReplies {
         &mut self.waits.n2_late
     }
-}
-
-/// Whether the turn is a step of a command that starts the motor of this drive, perhaps by a sequence of words; not the stop
-/// that follows a start that failed.
-fn starts_motor(turn: &Turn, index: DriveIndex, drive: &mut DriveState) -> bool {
-    let Purpose::Command { slot, .. } = &turn.purpose else {
-        return false;
-    };
-    drive
-        .run(*slot)
-        .is_some_and(|run| run.may_write_on() && run.intent().effects.on(index).starts())
 }
 
 #[cfg(test)]

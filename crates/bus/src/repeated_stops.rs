@@ -36,10 +36,12 @@ impl RepeatedStops {
         }
     }
 
-    /// Notes that a request is sent: a start supersedes an earlier stop.
-    pub(super) fn sending(&mut self, profile: &Profile, pdu: &RequestPdu, now: Instant) {
+    /// Notes that a request is sent: a run command supersedes an earlier stop. The other writes of a start (`of_start`)
+    /// change nothing, even if their words are those of a stop: another stop may end the start before its run command.
+    pub(super) fn sending(&mut self, profile: &Profile, pdu: &RequestPdu, of_start: bool, now: Instant) {
         match runs_by(profile, pdu) {
-            Some(true) => self.superseded(),
+            Some(true) => self.due = [None; AGAIN.len()],
+            Some(false) if of_start => {}
             Some(false) => {
                 let unanswered = self.unanswered.take();
                 if unanswered.is_some_and(|at| now.saturating_duration_since(at) < MAY_ARRIVE) {
@@ -48,11 +50,6 @@ impl RepeatedStops {
             }
             None => {}
         }
-    }
-
-    /// A start has begun, whose first words may be those of a stop.
-    pub(super) fn superseded(&mut self) {
-        self.due = [None; AGAIN.len()];
     }
 
     /// Whether a stop is still to be written again, or may have to be.
@@ -81,7 +78,7 @@ mod tests {
             let at = |ms| start + Duration::from_millis(ms);
             let mut stops = RepeatedStops::default();
             stops.not_answered(&profile, lost, start);
-            stops.sending(&profile, &stop, at(500));
+            stops.sending(&profile, &stop, false, at(500));
             let due = |stops: &mut RepeatedStops| {
                 (0..10_000u64)
                     .step_by(100)
@@ -90,7 +87,7 @@ mod tests {
             };
             let times = due(&mut stops);
             assert_eq!(times, [1500, 3500][..repeats], "{lost:?}");
-            stops.sending(&profile, &stop, at(10_000));
+            stops.sending(&profile, &stop, false, at(10_000));
             assert_eq!(
                 due(&mut stops),
                 [0u64; 0],
@@ -106,11 +103,11 @@ mod tests {
         let now = Instant::now();
         let mut stops = RepeatedStops::default();
         stops.not_answered(&profile, &word(1), now);
-        stops.sending(&profile, &word(0), now);
-        stops.sending(&profile, &word(1), now);
+        stops.sending(&profile, &word(0), false, now);
+        stops.sending(&profile, &word(1), true, now);
         assert!(!stops.take_due(now + Duration::from_secs(9)));
         stops.not_answered(&profile, &word(1), now);
-        stops.sending(&profile, &word(0), now + MAY_ARRIVE);
+        stops.sending(&profile, &word(0), false, now + MAY_ARRIVE);
         assert!(!stops.take_due(now + 2 * MAY_ARRIVE));
     }
 }

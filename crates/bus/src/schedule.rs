@@ -444,6 +444,11 @@ impl Schedule {
         }
     }
 
+    /// Whether such a read of a drive is still to be answered for the first time since the drive came online.
+    pub(crate) fn awaits(&self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool) -> bool {
+        self.drives.of(drive).awaits(covers)
+    }
+
     /// Reads everything of a drive again, including points of the class `once`.
     pub(crate) fn read_again(&mut self, index: DriveIndex, now: Instant) {
         let drive = self.drives.of_mut(index);

@@ -35,6 +35,15 @@ pub struct KnownWords {
     pub(super) functions: TakenFunctions,
 }
 
+/// The direction that clients ordered last for a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct OrderedDirection {
+    /// Whether the motor is to turn in reverse.
+    pub reverse: bool,
+    /// Whether the next start must set the direction, because no word of the drive has it.
+    pub at_next_start: bool,
+}
+
 impl KnownWords {
     /// Remembers a word that the drive reports.
     pub(crate) fn learn(&mut self, table: Table, address: u16, word: u16) {
@@ -59,6 +68,7 @@ impl KnownWords {
             let masked = self
                 .words
                 .remove(&place)
+                .or_else(|| self.before.get(&place).copied())
                 .map(|word| word & and_mask | or_mask & !and_mask);
             self.before.extend(masked.map(|word| (place, word)));
         }
@@ -144,9 +154,26 @@ impl KnownWords {
         self.waits_for_start = false;
     }
 
+    /// The direction that was ordered last, for the bus that replaces this one; `None` if none was ordered.
+    pub(crate) fn handed_over(&self, control: &Control) -> Option<OrderedDirection> {
+        let waiting = self.at_next_start().map(|reverse| OrderedDirection {
+            reverse,
+            at_next_start: true,
+        });
+        let last = || {
+            let reverse = self.last_direction(control)?;
+            Some(OrderedDirection {
+                reverse,
+                at_next_start: false,
+            })
+        };
+        waiting.or_else(last)
+    }
+
     /// Continues with the direction that was ordered last on the bus before a reload.
-    pub(crate) fn take_over(&mut self, direction: Option<bool>) {
-        self.direction = direction;
+    pub(crate) fn take_over(&mut self, ordered: Option<OrderedDirection>) {
+        self.direction = ordered.map(|ordered| ordered.reverse);
+        self.waits_for_start = ordered.is_some_and(|ordered| ordered.at_next_start);
     }
 
     /// Notes the direction in which the motor turns by its command, or that this is not known.
@@ -166,7 +193,7 @@ impl KnownWords {
         self.last_direction(control).or(self.turns).unwrap_or(false)
     }
 
-    /// The direction that was ordered last, for the bus that replaces this one; `None` if none was ordered.
+    /// The direction that was ordered last; `None` if none was ordered.
     pub(crate) fn last_direction(&self, control: &Control) -> Option<bool> {
         let last = |place: ControlItem| {
             let before = || self.before.get(&(place.table, place.address)).copied();

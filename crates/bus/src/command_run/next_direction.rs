@@ -67,6 +67,20 @@ impl CommandRun {
     }
 }
 
+/// Whether an order is a run command that names no direction.
+pub(crate) fn names_no_direction(profile: &Profile, order: &Order) -> bool {
+    let Order::Points(values) = order else {
+        return false;
+    };
+    let named = |point: ModelPoint| {
+        let index = profile.model_index(point)?;
+        let written = profile.points.get(index)?.write_to.unwrap_or(index);
+        let mut values = values.iter();
+        values.find(|(of, _)| *of == written).map(|(_, value)| value.as_bool())
+    };
+    named(ModelPoint::Run) == Some(true) && named(ModelPoint::Reverse).is_none()
+}
+
 /// The direction that an order names, where the family has it in its run commands only.
 fn direction_at_stop(profile: &Profile, order: &Order) -> Option<bool> {
     let control = profile.control.as_ref()?;

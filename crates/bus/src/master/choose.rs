@@ -328,7 +328,7 @@ impl Master {
         let redundant = |drive: DriveIndex| *stands.of(drive);
         let facts = AtTurn::of(drives, &bus.image.drives, now);
         for rank in RANKS {
-            let ready = |command: &Command| is_ready(command, schedule, waits, drives, now);
+            let ready = |command: &Command| is_ready(command, schedule, waits, drives, &bus.image.drives, now);
             let choice = pending.next(rank, now, &facts, ready, redundant);
             *commands.queued.of_mut(rank) = choice.chosen;
             if let Some(until) = choice.wake_at {

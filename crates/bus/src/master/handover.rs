@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::Master;
+use crate::command_run::OrderedDirection;
 use crate::drive_state::DriveState;
 use crate::late_replies::{FORGOTTEN_AFTER, LateReplies};
 use crate::line_state::Learned;
@@ -22,8 +23,8 @@ pub struct CarriedState {
     pub repeated: Repeated,
     /// The stops that are to be written again.
     pub stops: RepeatedStops,
-    /// The direction that was ordered last, `true` for reverse.
-    pub direction: Option<bool>,
+    /// The direction that was ordered last.
+    pub direction: Option<OrderedDirection>,
 }
 
 impl CarriedState {
@@ -88,7 +89,7 @@ impl Master {
                 lease: drive.supervision.lease(),
                 repeated: drive.refresh.handed_over(),
                 stops: drive.repeated_stops,
-                direction: control.and_then(|control| drive.words.last_direction(control)),
+                direction: control.and_then(|control| drive.words.handed_over(control)),
             }
         };
         let leases = self.drives.iter_mut().zip(&self.bus.image.drives).map(close).collect();

@@ -1,14 +1,18 @@
 //! Requests forwarded for a tool, and the gateway's own broadcasts: decides when they may be sent, and sends them.
 
+use std::sync::Arc;
 use std::time::Instant;
 
+use super::awaited_direction::waits_for_direction;
 use super::background::{ChosenTransaction, Sending};
+use super::choose::may_begin;
 use super::permission::AtTurn;
 use super::waits::Waits;
 use super::{Master, Turn};
 use crate::drive_state::DriveState;
 use crate::schedule::{Admission, Schedule};
 use drivegate_core::order::{Command, Order, Outcome, Pace, PassedOn};
+use drivegate_core::process_image::DriveImage;
 use drivegate_core::queue::{Choice, Pending, Ready};
 use drivegate_model::drive::PerDrive;
 
@@ -56,7 +60,8 @@ impl Master {
             ..
         } = self;
         let facts = AtTurn::of(drives, &bus.image.drives, now);
-        pending.next_passed_on(now, &facts, |command| is_ready(command, schedule, waits, drives, now))
+        let ready = |command: &Command| is_ready(command, schedule, waits, drives, &bus.image.drives, now);
+        pending.next_passed_on(now, &facts, ready)
     }
 
     /// The broadcast of a stop of all drives, which is sent before their single stops if that is possible at once.
@@ -112,14 +117,19 @@ impl Master {
 /// command is answered for it.
 pub(super) fn is_ready(
     command: &Command,
-    schedule: &Schedule,
+    schedule: &mut Schedule,
     waits: &mut Waits,
     drives: &mut PerDrive<DriveState>,
+    images: &PerDrive<Arc<DriveImage>>,
     now: Instant,
 ) -> Ready {
     let drive = command.drive().filter(|_| command.as_passed_on().is_none());
     match drive {
-        Some(index) => super::choose::may_begin(drives.of_mut(index), command, schedule.is_online(index), now),
+        Some(index) => {
+            let (drive, profile) = (drives.of_mut(index), &images.of(index).spec.profile);
+            waits_for_direction(command, index, drive, profile, schedule, now)
+                .unwrap_or_else(|| may_begin(drive, command, schedule.is_online(index), now))
+        }
         None => waits.may_pass_on(command, drives, now),
     }
 }

@@ -63,6 +63,8 @@ pub(super) struct Item {
     pub(super) is_pending: bool,
     /// Whether the read was never answered so far.
     pub(super) unread: bool,
+    /// Whether the drive answered the read since it came online.
+    pub(super) is_answered: bool,
     /// When a command changed the registers of this item; it is then read before the round, so that the command is
     /// confirmed soon.
     pub(super) changed_at: Option<Instant>,
@@ -197,6 +199,7 @@ impl Item {
             failed_at: None,
             is_pending: read.class != PollClass::Fault,
             unread: !matches!(read.class, PollClass::Fault | PollClass::Monitor),
+            is_answered: false,
             changed_at: None,
             whole_again: None,
         }
@@ -323,6 +326,14 @@ impl DriveSchedule {
     pub(super) fn has_unread(&self) -> bool {
         let unread = |item: &Item| item.unread && !item.refused && item.failures == 0 && item.is_slow();
         self.presence == Presence::Online && self.items.iter().any(unread)
+    }
+
+    /// Whether a read that the drive neither refuses nor leaves unanswered was not answered since the drive came online.
+    pub(super) fn awaits(&self, covers: impl Fn(&PlannedRead) -> bool) -> bool {
+        let is_read = |class: PollClass| matches!(class, PollClass::Fast | PollClass::Slow | PollClass::Once);
+        let is_sound = |item: &Item| !item.refused && !item.never_answers && item.failures == 0;
+        let awaited = |item: &&Item| !item.is_answered && is_sound(item) && is_read(item.read.class);
+        self.presence == Presence::Online && self.items.iter().filter(awaited).any(|item| covers(&item.read))
     }
 
     /// Whether slow reads wait until process data shows that the drive still answers.

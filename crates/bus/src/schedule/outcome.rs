@@ -35,6 +35,7 @@ impl Schedule {
             for item in &mut drive.items {
                 item.is_pending = item.read.class != PollClass::Fault;
                 item.due = now;
+                item.is_answered = false;
                 if !item.never_answers {
                     item.failures = 0;
                 }
@@ -46,6 +47,7 @@ impl Schedule {
         } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
             item.failures = 0;
             item.unread = false;
+            item.is_answered = true;
             item.refusals = 0;
             let was_in_vain = [&mut item.refused, &mut item.never_answers].map(std::mem::take);
             if was_in_vain.contains(&true) {

@@ -100,13 +100,14 @@ impl RemovedDrives {
 }
 
 impl Leases {
-    /// Takes the leases of a stopped bus; `leases` are those of its drives, in order. A drive that could not have a
-    /// lease has left none.
+    /// Takes the states of a stopped bus; `leases` are those of its drives, in order. A drive that could not have a
+    /// lease and has nothing else to continue has left none.
     pub(super) fn left(&mut self, bus: &BusSettings, leases: Vec<CarriedState>) {
         let all = bus.drives.iter().zip(leases);
-        for (drive, carried) in all
-            .filter(|(drive, carried)| is_commanded(drive) && (drive.supervision.is_some() || carried.stops.is_any()))
-        {
+        let continues = |drive: &DriveSpec, carried: &CarriedState| {
+            drive.supervision.is_some() || carried.stops.is_any() || carried.direction.is_some()
+        };
+        for (drive, carried) in all.filter(|(drive, carried)| is_commanded(drive) && continues(drive, carried)) {
             let left = LeftLease {
                 carried,
                 control: drive.profile.control.clone(),

@@ -86,6 +86,11 @@ impl FamilyDrive {
         }
     }
 
+    /// Shows this word in a register that shows states.
+    pub(super) fn show_word(&mut self, address: u16, word: u16) {
+        self.items.insert((Table::Holding, address), word);
+    }
+
     /// The motor turns from now on.
     pub(super) fn run(&mut self) {
         self.runs = true;

@@ -270,6 +270,47 @@ fn control_steps(control: &drivegate_model::drive::control::Control) -> usize {
 }
 
 /// A reload ends the bus and begins another one, which knows no word of the drive.
+/// A run command behind a stop that is to be sent again writes its reference, and another stop ends it before its run word:
+/// the write that the network holds may still arrive, so that the stop is sent again as before.
+#[test]
+fn a_start_that_ends_before_its_run_word_ends_no_repeated_stop() {
+    for family in ["vacon-nx", "danfoss-fc", "abb-acs580", "siemens-g120", "delta-ms300"] {
+        let mut rig = behind_a_network(family);
+        rig.drives[0].next_write = Some(Ended::Silent);
+        rig.order(0, "a", ModelPoint::SpeedReference, Value::Number(30.0));
+        rig.run(Duration::from_millis(300));
+        rig.switch(0, "a", false);
+        rig.run(Duration::from_millis(200));
+        let pending = rig.master.drives[0].repeated_stops.is_any();
+        assert!(pending, "{family}: the stop is to be sent again");
+        let profile = &rig.bus.image.drives[0].spec.profile;
+        let index = |point| profile.model_index(point).unwrap();
+        let order = Order::Points(vec![
+            (index(ModelPoint::SpeedReference), Value::Number(40.0)),
+            (index(ModelPoint::Run), Value::Bool(true)),
+        ]);
+        let origin = Origin::new(SourceKind::Mqtt, "b");
+        let window = window(rig.now, DEFAULT_EXPIRY);
+        let mut start = submit(&rig.bus, DriveIndex::new(0), origin, order, window, rig.now);
+        let from = rig.wire.len();
+        while !rig.wire[from..].iter().any(|(_, turn)| turn.pdu().is_write()) {
+            rig.step();
+        }
+        let mut stop = rig.switch(0, "a", false);
+        while outcome(&mut stop).is_none() {
+            rig.step();
+        }
+        assert!(outcome(&mut start).is_some_and(|outcome| !outcome.is_ok()), "{family}");
+        let stopped = rig.now;
+        rig.run(Duration::from_secs(5));
+        let again = rig
+            .wire
+            .iter()
+            .filter(|(at, turn)| *at > stopped && turn.pdu().is_write());
+        assert_eq!(again.count(), 2, "{family}");
+    }
+}
+
 #[test]
 fn a_reload_keeps_the_direction_of_a_run_command_that_names_none() {
     for (family, back) in [("danfoss-fc", 0x847C), ("weg-cfw", 0x0013), ("fuji-frenic", 0x0002)] {
@@ -311,5 +352,85 @@ fn a_reload_keeps_the_direction_of_a_run_command_that_names_none() {
                 rig.run(Duration::from_secs(2));
             }
         }
+    }
+}
+
+/// The gateway has just started and has read one register of a drive whose motor turns in reverse: a run command that names no
+/// direction waits for the reads that show the direction, and does not reverse the motor.
+#[test]
+fn a_run_command_waits_until_the_direction_of_the_motor_is_read() {
+    for (family, back) in [
+        ("danfoss-fc", 0x847C),
+        ("weg-cfw", 0x0013),
+        ("fuji-frenic", 0x0002),
+        ("delta-ms300", 0x0022),
+    ] {
+        let mut rig = Rig::empty(1, family, Protocol::ModbusRtu, Duration::from_millis(10), |spec| {
+            DriveSpec {
+                supervision: None,
+                ..spec
+            }
+        });
+        let mut drive = FamilyDrive::new(&drivegate_testkit::profile(family));
+        drive.run();
+        if family == "danfoss-fc" {
+            drive.show_word(50_199, 0x0A07);
+            drive.show_word(50_209, (-0x2000_i16) as u16);
+            drive.show_word(50_009, 0x2000);
+        } else {
+            drive.show(ModelPoint::Reversed, true);
+        }
+        rig.drives[0].family = Some(drive);
+        while !matches!(rig.bus.image.drives[0].snapshot().link, Link::Online(_)) {
+            rig.step();
+        }
+        let mut run = rig.switch(0, "a", true);
+        let outcome = loop {
+            rig.step();
+            if let Some(outcome) = outcome(&mut run) {
+                break outcome;
+            }
+        };
+        let words = rig
+            .wire
+            .iter()
+            .filter_map(|(_, turn)| drivegate_core::order::written(turn.pdu()));
+        let words: Vec<u16> = words.flat_map(|(_, items)| items).map(|(_, word)| word).collect();
+        assert!(
+            outcome.is_ok() && words == [back],
+            "{family}: {words:04X?}, {outcome:?}"
+        );
+    }
+}
+
+/// A direction that waits for the next start, because the drive has no word for it at standstill, waits behind a reload too.
+#[test]
+fn a_direction_for_the_next_start_outlives_a_reload() {
+    for (family, back) in [("danfoss-fc", 0x847C), ("fuji-frenic", 0x0002)] {
+        let mut rig = behind_a_network(family);
+        let ordered = |rig: &mut Rig, point: ModelPoint, on: bool| {
+            let mut answer = rig.order(0, "a", point, Value::Bool(on));
+            let from = rig.wire.len();
+            while outcome(&mut answer).is_none() {
+                rig.step();
+                assert!(rig.wire.len() < from + 4000, "{family}: no answer to {point:?}");
+            }
+            rig.wire[from..]
+                .iter()
+                .filter_map(|(_, turn)| drivegate_core::order::written(turn.pdu()))
+                .flat_map(|(_, items)| items)
+                .map(|(_, word)| word)
+                .collect::<Vec<u16>>()
+        };
+        ordered(&mut rig, ModelPoint::Run, true);
+        // Stopped at its panel.
+        rig.drives[0].family.as_mut().unwrap().stand();
+        rig.run(Duration::from_secs(1));
+        ordered(&mut rig, ModelPoint::Reverse, true);
+        let handover = rig.master.ended(None, rig.now);
+        rig.begin_anew(&handover);
+        rig.run(Duration::from_secs(2));
+        let words = ordered(&mut rig, ModelPoint::Run, true);
+        assert!(words.contains(&back), "{family}: {words:04X?}");
     }
 }

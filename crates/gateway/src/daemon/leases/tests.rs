@@ -2,6 +2,7 @@ use std::time::Instant;
 
 use super::*;
 use crate::config::Settings;
+use drivegate_bus::command_run::OrderedDirection;
 use drivegate_bus::supervision::Lease;
 
 /// A lease that has been running since then.
@@ -144,4 +145,28 @@ fn a_bus_that_a_reload_stopped_is_freed_after_two_minutes() {
         removed.forget(now + after);
         assert_eq!(image.strong_count() > 0, is_known, "{after:?}");
     }
+}
+
+#[test]
+fn the_direction_of_a_drive_without_supervision_goes_with_the_machine() {
+    let drives = [("pump-1", 1, "control"), ("pump-2", 2, "control")];
+    let unsupervised = |drives| {
+        let mut bus = bus("/dev/ttyUSB0", drives);
+        bus.drives.iter_mut().for_each(|drive| drive.supervision = None);
+        bus
+    };
+    let reverse = OrderedDirection {
+        reverse: true,
+        at_next_start: false,
+    };
+    let carried = CarriedState {
+        direction: Some(reverse),
+        ..CarriedState::default()
+    };
+    let mut leases = Leases::default();
+    leases.left(&unsupervised(&drives), vec![carried, CarriedState::default()]);
+    let renamed = unsupervised(&[("pump-1", 2, "control"), ("pump-2", 1, "control")]);
+    let of = leases.of(&renamed, Instant::now());
+    let directions: Vec<_> = of.iter().map(|carried| carried.direction).collect();
+    assert_eq!(directions, [None, Some(reverse)]);
 }
