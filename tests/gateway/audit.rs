@@ -126,7 +126,7 @@ fn a_client_that_may_not_write_destroys_nothing() {
     let whole = verify(&site, &[]);
     assert!(whole.status.success(), "{whole:?}");
     let hash = gateway
-        .output()
+        .until_printed("last line of the audit file")
         .lines()
         .rfind(|line| line.contains("last line of the audit file"))
         .map(|line| {

@@ -193,5 +193,6 @@ fn confirmed_repeated_refused_and_audited() {
             .iter()
             .all(|r| r["client"].as_str().unwrap().starts_with("127.0.0.1:"))
     );
-    assert!(gateway.output().contains("confirmed_us"), "the journal has it too");
+    // The journal has it, too.
+    gateway.until_printed("confirmed_us");
 }

@@ -41,11 +41,11 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
             .find(|drive| api(http, drive)["state"] == "running")
     });
 
-    let metrics = get(http, "/metrics").unwrap().1;
-    assert!(
-        metrics.contains("drivegate_drive_output_frequency_hertz{bus=\"line1\",drive=\"pump-1\"}"),
-        "{metrics}"
-    );
+    until("the frequency of pump-1", || {
+        let metrics = get(http, "/metrics")?.1;
+        let wanted = "drivegate_drive_output_frequency_hertz{bus=\"line1\",drive=\"pump-1\"}";
+        metrics.contains(wanted).then_some(())
+    });
     let payload = "{\"run\": true, \"speed_reference\": 50}";
     // A pause of the machine makes an order expire; a client that has no answer gives it again.
     until("pump-1 at its reference", || {
@@ -187,11 +187,10 @@ fn every_line_that_it_prints_can_be_pasted_whole() {
         let line = line
             .replace("127.0.0.1:9488", &format!("127.0.0.1:{http}"))
             .replace("-p 1502", &format!("-p {modbus}"));
-        let output = pasted(&line);
-        assert!(
-            output.status.success() && !output.stdout.is_empty(),
-            "{line}: {output:?}"
-        );
+        until(&line, || {
+            let output = pasted(&line);
+            (output.status.success() && !output.stdout.is_empty()).then_some(())
+        });
     }
     for line in &lines {
         until(line, || {
@@ -207,14 +206,13 @@ fn every_line_that_it_prints_can_be_pasted_whole() {
 
     // The other commands find the demo by its configuration, also under another name of its directory.
     let config = dir.join("drivegate.toml").display().to_string();
-    let read = drivegate(&["read", "--config", &config, "--json", "pump-1", "state", "fault_text"])
-        .output()
-        .unwrap();
-    let values: Vec<serde_json::Value> = serde_json::from_slice(&read.stdout).unwrap();
-    assert_eq!(
-        (&values[0]["value"], &values[1]["value"]),
-        (&"ready".into(), &"".into())
-    );
+    until("its values", || {
+        let read = drivegate(&["read", "--config", &config, "--json", "pump-1", "state", "fault_text"])
+            .output()
+            .unwrap();
+        let values: Vec<serde_json::Value> = serde_json::from_slice(&read.stdout).unwrap();
+        (values[0]["value"] == "ready" && values[1]["value"] == "").then_some(())
+    });
     let url = format!("http://127.0.0.1:{http}");
     let watched = drivegate(&["watch", "--once", "--url", &url]).output().unwrap();
     assert!(String::from_utf8_lossy(&watched.stdout).contains("ahu-3"));

@@ -234,6 +234,10 @@ fn a_gateway_killed_in_a_drill_stops_the_motor_when_it_is_back() {
         "{drill}"
     );
     plant.site.until_point("pump-2", "running", false);
+    until("the end of the drill on disk", || {
+        let text = std::fs::read_to_string(plant.site.file("state/drills.json")).ok()?;
+        text.contains("\"aborted\"").then_some(())
+    });
     // The next start finds nothing to stop.
     plant.others[1].signal("KILL");
     plant.others[1].ended();

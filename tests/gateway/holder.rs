@@ -126,7 +126,7 @@ fn who_sees_and_may_what() {
     );
     // A stop of any client passes and ends the hold; a stop of a client without a principal reserves nothing.
     let answer = plant.site.ask("pump-1/set", r#"{"run": false}"#);
-    assert_eq!(answer["result"], "confirmed", "{answer}");
+    assert_eq!(answer["ok"], true, "{answer}");
     assert_eq!(plant.seen(), (0, 0, json!("free"), json!(null)));
     // After the stop of the operator, the PLC does not start the motor by repeating its command.
     plant.write(0x8100, &[1, 5000]).unwrap();

@@ -32,8 +32,9 @@ fn an_absent_drive_with_a_long_timeout_holds_up_neither_the_watchdog_nor_a_reloa
     // The watchdog is looked at twice a second, an exchange takes 5 s.
     until("two requests", || (line.transcript().len() > 1).then_some(()));
     notified.until("WATCHDOG=1");
+    // A pause of the machine may look like a stall once; an exchange that held up the watchdog would do so nine times.
     let printed = gateway.output();
-    assert!(!printed.contains("stalled"), "{printed}");
+    assert!(printed.matches("stalled").count() < 3, "{printed}");
     // The exchange that waits is broken off for a reload of its bus, and for a stop.
     site.change("silence = \"chars\"", "silence = \"spec\"");
     gateway.signal("HUP");

@@ -12,7 +12,7 @@ use tempfile::TempDir;
 
 use super::drive_access::{Line, Ran, ran};
 use crate::support::mqtt::next_json;
-use crate::support::process::{self, Running, free_port, mbpoll_read, mbpoll_write, until};
+use crate::support::process::{self, Running, free_port, mbpoll_read, mbpoll_write, until, write_registers};
 use crate::support::site::curl;
 use crate::support::tools::tool;
 
@@ -375,7 +375,7 @@ impl Family {
     fn only_run_runs(&self) {
         self.write(&["run=true", "speed_reference=40"]);
         self.until_running(true);
-        let scada = |word| mbpoll_write(self.modbus, 2, 33_024, &[word]).unwrap();
+        let scada = |word| write_registers(self.modbus, 2, 33_024, &[word]);
         scada(0);
         // The stop is accepted, the motor still slows down.
         self.write(&["fault_reset=true"]);

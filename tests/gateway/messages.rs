@@ -180,7 +180,7 @@ fn the_gateway_at_the_port_is_named() {
     site.change("[gateway]\n", "[gateway]\nsocket = \"own.sock\"\n");
     let _line = site.line(&[1]);
     let gateway = site.run();
-    gateway.until_printed("drive pump-1 is online");
+    gateway.until_printed("drivegate is running");
     let (port, config) = (site.path("line1"), site.config());
     let ended = command(&["scan", "--port", &port, "--addresses", "1"]);
     assert_eq!(ended.code, 1, "{}", ended.err);

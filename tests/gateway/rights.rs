@@ -315,9 +315,12 @@ fn a_start_of_a_tool_that_waits_is_not_sent_without_its_right() {
         // On a busy machine a reload may take longer than the start waits.
         until("a reload in time", || {
             let mut tool = until("the slot", || TcpStream::connect(("127.0.0.1", port)).ok());
-            tool.set_read_timeout(Some(PATIENCE)).unwrap();
-            tool.write_all(&frame(2002, 1000)).unwrap();
-            tool.read_exact(&mut [0; 8]).unwrap();
+            // The slot gives no answer that is older than a second, as after a pause of the machine.
+            tool.set_read_timeout(Some(Duration::from_secs(3))).unwrap();
+            until("an answer", || {
+                tool.write_all(&frame(2002, 1000)).unwrap();
+                tool.read_exact(&mut [0; 8]).ok()
+            });
             tool.write_all(&frame(2000, 1)).unwrap();
             let asked = Instant::now();
             std::thread::sleep(Duration::from_millis(30));
@@ -356,9 +359,13 @@ fn a_message_on_its_way_starts_nothing_once_commands_are_off() {
             .unwrap();
         std::thread::sleep(Duration::from_millis(100));
         let before = site.change("commands = true", "commands = false");
+        let http = format!("127.0.0.1:{}", site.http);
+        site.change(&http, &format!("127.0.0.1:{}", free_port()));
         gateway.signal("HUP");
+        // The former address closes once the reload has ended the right.
+        until("its rights have ended", || TcpStream::connect(&http).err());
         // The client has half a second for an orderly end, during which it is still subscribed.
-        std::thread::sleep(Duration::from_millis(60 * round));
+        std::thread::sleep(Duration::from_millis(60 * (round - 1)));
         broker.signal("CONT");
         let _ = publisher.wait();
         until("the reload", || {

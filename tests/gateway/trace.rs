@@ -200,7 +200,7 @@ fn silence_of_a_drive_is_shown() {
         trace
             .output()
             .lines()
-            .find(|line| line.contains("timeout"))
+            .find(|line| line.contains("pump-2") && line.contains("timeout"))
             .map(str::to_string)
     });
     let fields: Vec<&str> = text.split_whitespace().collect();

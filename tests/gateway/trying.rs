@@ -128,6 +128,9 @@ impl TwoDrives {
             "38400",
             "--addresses",
             "1-8",
+            // On a busy machine a drive may answer later than within 100 ms.
+            "--timeout",
+            "1s",
         ];
         [&fixed[..], more].concat().iter().map(ToString::to_string).collect()
     }
@@ -336,7 +339,9 @@ fn a_script_has_an_option_for_the_question() {
     let written = rig.path("plant.toml");
     let mut trial = Running::drivegate(&words(&rig.arguments(&["--write", &written])));
     let printed = trial.until_printed("Configuration written to ");
-    assert_eq!(api(page(&printed), "drive-1")["state"], "ready");
+    until("the drive", || {
+        (api(page(&printed), "drive-1")["state"] == "ready").then_some(())
+    });
     is_sound(&written);
     trial.signal("TERM");
     assert!(trial.ended().success());
@@ -368,7 +373,7 @@ fn what_was_heard_tells_a_dead_line_from_a_wrong_setting() {
     let link = folder.path().join("line").display().to_string();
     let _noisy = Running::drivegate(&["simulate", "--link", &link, "--fault", "corrupt=1"]);
     until("the line", || Path::new(&link).exists().then_some(()));
-    let wrong = ran(drivegate(&["try", "--port", &link, "--addresses", "1"]).args(fast));
+    let wrong = ran(drivegate(&["try", "--port", &link, "--addresses", "1", "--timeout", "1s"]).args(fast));
     assert_eq!(wrong.code, 1, "{}", wrong.err);
     assert!(
         wrong

@@ -88,6 +88,9 @@ async fn an_n2_slave_in_python() {
                 .all(|frame| heard.iter().any(|line| line == frame))
                 .then_some(())
         });
-        assert_eq!(heard()[..3], ["01FA7", "0104C5", "0105C6"]);
+        // After a pause of the machine a request is sent again.
+        let mut first = heard();
+        first.dedup();
+        assert_eq!(first[..3], ["01FA7", "0104C5", "0105C6"]);
     }
 }

@@ -178,9 +178,9 @@ fn messages_reach_subscribers_of_both_versions() {
 fn retained_messages_are_set_replaced_and_deleted() {
     for version in VERSIONS {
         let rig = DemoBroker::new();
-        rig.publish(version, &["-t", "s/1", "-m", "old", "-r"]);
+        rig.publish(version, &["-t", "s/1", "-m", "old", "-r", "-q", "1"]);
         rig.publish(version, &["-t", "s/1", "-m", "new", "-r", "-q", "1"]);
-        rig.publish(version, &["-t", "s/2", "-m", "gone", "-r"]);
+        rig.publish(version, &["-t", "s/2", "-m", "gone", "-r", "-q", "1"]);
         rig.publish(version, &["-t", "s/2", "-n", "-r"]);
         let reader = rig.subscribe(version, &["-t", "s/#", "-q", "1"]);
         assert_eq!(reader.line(), "s/1 q1 r1 new");

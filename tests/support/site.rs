@@ -166,6 +166,8 @@ impl Site {
     pub(crate) fn run_ready(&self) -> Running {
         let gateway = self.run();
         until_ready(self.http);
+        // The local socket opens last.
+        gateway.until_printed("drivegate is running");
         gateway
     }
 

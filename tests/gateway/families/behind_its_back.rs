@@ -7,6 +7,7 @@ use drivegate_model::drive::profile::Profiles;
 
 use super::Rig;
 use super::cases::{Case, cases};
+use crate::support::process::until;
 
 /// Signal to the drive, and the text that it prints.
 const HAPPENS: [(&str, &str); 3] = [
@@ -106,13 +107,13 @@ fn a_direction_that_waits_is_that_of_the_next_start() {
         rig.printed("motor stopped", 0);
         let (_, result) = rig.command("{\"reverse\": true}");
         assert_eq!(result["result"], "acknowledged", "{name}: {result}");
-        let audit = rig.site.audit();
-        let told = audit.iter().any(|record| {
-            record["text"]
-                .as_str()
-                .is_some_and(|text| text.starts_with("the direction takes effect"))
+        until(&format!("{name}: the record of the direction"), || {
+            let audit = rig.site.audit();
+            let mut texts = audit.iter().filter_map(|record| record["text"].as_str());
+            texts
+                .any(|text| text.starts_with("the direction takes effect"))
+                .then_some(())
         });
-        assert!(told, "{name}: {audit:?}");
         rig.command("{\"run\": false}");
         rig.command("{\"run\": true}");
         rig.printed("motor reverse", 0);

@@ -85,6 +85,7 @@ fn plant() -> Plant {
     let broker = site.broker();
     let mut client = client("mosquitto_sub", site.mqtt);
     let heard = Running::spawn(client.args(["-t", "spBv1.0/#", "-F", "%r|%q|%t|%x"]));
+    broker.until_printed("New client connected");
     let gateway = site.run_ready();
     site.until_connected(true);
     site.until_state("pump-1", "ready");

@@ -114,7 +114,11 @@ fn a_removed_user_stops_nothing_and_the_lease_does() {
         let ran = run(&tool("curl"), &["-sS", "-u", "alice:correct horse", "-d", body, &url]);
         String::from_utf8(ran.stdout).unwrap()
     };
-    assert!(curl("{\"run\": true, \"speed_reference\": 40}").contains("\"ok\":true"));
+    until("the start", || {
+        curl("{\"run\": true, \"speed_reference\": 40}")
+            .contains("\"ok\":true")
+            .then_some(())
+    });
     assert!(user(&site, &["remove"], "alice", "").contains("was removed"));
     gateway.signal("HUP");
     until("alice is out", || {

@@ -18,7 +18,7 @@ use drivegate_north::{NorthState, ServerError};
 use drivegate_north::{Reconfigure as _, Server as _};
 use drivegate_proto::{Protocol, Reply, RequestPdu, Table};
 use drivegate_testkit::{bus_spec, monitored, nx, profile, take_next};
-use rustix::event::{PollFd, PollFlags, poll};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
 use tokio_util::sync::CancellationToken;
@@ -101,8 +101,17 @@ impl FakeBus {
         let (paused, stop) = (bus.paused.clone(), bus.stop.clone());
         bus.thread = Some(std::thread::spawn(move || {
             let mut kept = Vec::new();
+            // A start that arrives during a stall of the machine goes a moment later, and nothing else wakes the queue then.
+            let pause = Timespec {
+                tv_sec: 0,
+                tv_nsec: 20_000_000,
+            };
             while !stop.load(Ordering::SeqCst) {
-                poll(&mut [PollFd::from_borrowed_fd(queue.wake_fd(), PollFlags::IN)], None).unwrap();
+                poll(
+                    &mut [PollFd::from_borrowed_fd(queue.wake_fd(), PollFlags::IN)],
+                    Some(&pause),
+                )
+                .unwrap();
                 queue.clear_wake();
                 while !paused.load(Ordering::SeqCst) {
                     let Some(command) = take_next(&queue, Instant::now()) else {

@@ -316,9 +316,9 @@ async fn who_never_ends_the_handshake_is_closed() {
             slow.send(bytes).await;
             later(1.5).await;
         }
-        later(9.0 - 1.5 * begun.len().div_ceil(3) as f32).await;
+        later(7.0 - 1.5 * begun.len().div_ceil(3) as f32).await;
         assert_eq!(refused(&rig), round);
-        later(1.1).await;
+        later(3.1).await;
         assert!(slow.is_closed().await);
         until("it is counted", || refused(&rig) == round + 1).await;
     }

@@ -154,11 +154,12 @@ impl Broker {
 
     /// The retained message of a topic, with `mosquitto_sub`.
     pub(crate) fn retained(&self, topic: &str) -> Option<String> {
-        let output = self.run(
-            "mosquitto_sub",
-            &["-t", topic, "-W", "1", "-C", "1", "--retained-only", "-N"],
-        );
-        (!output.stdout.is_empty()).then(|| String::from_utf8(output.stdout).unwrap())
+        // A stall of the machine may take the second for which the client waits.
+        let arguments = ["-t", topic, "-W", "1", "-C", "1", "--retained-only", "-N"];
+        (0..2).find_map(|_| {
+            let output = self.run("mosquitto_sub", &arguments);
+            (!output.stdout.is_empty()).then(|| String::from_utf8(output.stdout).unwrap())
+        })
     }
 }
 

@@ -275,10 +275,13 @@ fn serves(broker: &Hostile, gateway: &Gateway, count: usize) {
     for text in &texts {
         gateway.publish_event("p1", EventKind::Fault, text);
     }
-    wait_for("the events", || (broker.events().len() >= count).then_some(()));
-    let mut events = broker.events();
-    events.dedup();
-    assert_eq!(events, texts);
+    let served = || {
+        let mut events = broker.events();
+        events.dedup();
+        events
+    };
+    wait_for("the events", || (served().len() >= count).then_some(()));
+    assert_eq!(served(), texts);
     wait_for("the buffer to be empty", || (gateway.buffered() == 0).then_some(()));
 }
 

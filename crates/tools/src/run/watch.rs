@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use sd_notify::NotifyState;
-use tokio::time::Interval;
+use tokio::time::{Interval, MissedTickBehavior};
 
 use super::notify;
 use crate::log::LogHandle;
@@ -38,13 +38,16 @@ impl Watch<'_> {
     pub(super) fn new<'l>(daemon: &Daemon, log: &'l LogHandle) -> Watch<'l> {
         let watchdog = sd_notify::watchdog_enabled();
         let every = watchdog.map_or(Duration::from_secs(5), |time| time / 2);
+        let mut feed = tokio::time::interval(every.max(Duration::from_millis(500)));
+        // Two looks right behind each other, after a pause of the machine, would take the buses for stalled.
+        feed.set_missed_tick_behavior(MissedTickBehavior::Delay);
         Watch {
             log,
             pulse: daemon.pulse(),
             plant: daemon.plant(),
             stats: daemon.stats(),
             is_watched: watchdog.is_some(),
-            feed: tokio::time::interval(every.max(Duration::from_millis(500))),
+            feed,
             refused: None,
             status: String::new(),
         }

@@ -49,13 +49,14 @@ async function aStopThatIsRefusedCannotBeMissed(gateway, page) {
 
 async function aStopWithoutAnAnswerIsSentAgain(gateway, page) {
   await opened(gateway, page, "#/", { state: "running" });
-  let answers = 0;
-  gateway.obey = () => (++answers < 3 ? [503, { result: "bus_down", error: { code: "bus_down", message: "line1 is down" } }] : [200, { result: "confirmed", confirmed_ms: 20 }]);
+  let carriesOut = false;
+  gateway.obey = () => (!carriesOut ? [503, { result: "bus_down", error: { code: "bus_down", message: "line1 is down" } }] : [200, { result: "confirmed", confirmed_ms: 20 }]);
   await page.eval(click, STOP);
-  await page.until(inBanner, "Sent 2 times since");
+  await page.until(() => /Sent \d+ times since/.test(document.getElementById("stops").innerText));
   assert.match(await page.eval(shown, "#stops"), /pump-1 was not stopped\. Stop it at the machine\. Bus down: line1 is down\.\s+.*it is being sent again/);
+  carriesOut = true;
   await page.until(inBanner, "was carried out");
-  assert.equal(gateway.commands.length, 3);
+  assert.ok(gateway.commands.length >= 3);
   await page.eval(click, "#stops button");
   // Of an answer that says so nobody knows.
   gateway.obey = () => [502, { result: "garbled", error: { code: "garbled", message: "no sound reply" } }];
