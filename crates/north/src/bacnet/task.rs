@@ -163,11 +163,13 @@ impl Task {
         self.stats.bacnet.set(None);
     }
 
-    /// Anyone who waits for a drive is answered, as long as the gateway waits.
+    /// Anyone who waits for a drive is answered, as long as the gateway waits. The next write of a request follows as ever: the
+    /// queues still take its stops and refuse everything else.
     async fn answer_what_was_begun(&mut self) {
         let until = tokio::time::Instant::now() + LAST_ANSWERS;
         while let Ok(Some(ended)) = tokio::time::timeout_at(until, self.writes.next()).await {
             self.desk.ended(&ended, Instant::now());
+            self.take_up_jobs();
             self.flush();
         }
     }

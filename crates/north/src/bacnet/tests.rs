@@ -14,6 +14,7 @@ use drivegate_core::process_image::{DriveSpec, Link};
 use drivegate_model::drive::{ModelPoint, PointIndex, Value};
 use drivegate_proto::{Reply, Table};
 
+mod ending;
 mod objects;
 mod orders;
 mod pauses;
