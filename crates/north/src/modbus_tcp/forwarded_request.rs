@@ -278,6 +278,8 @@ impl AnsweredRequest {
             .then
             .take_if(|_| outcome == Outcome::Acknowledged(Reply::Written))
         {
+            // The drive took the reset, whatever becomes of the read.
+            forwarded.resets = false;
             return forwarded.read_behind(then, client, now);
         }
         let Some(read) = &mut forwarded.read else {

@@ -447,3 +447,6 @@ fn stop_of_default(header: Header, drive: &DriveHandle, request: RequestPdu) -> 
     };
     forwarded(header, drive, request, work)
 }
+
+#[cfg(test)]
+mod tests;
