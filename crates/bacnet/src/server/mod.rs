@@ -34,6 +34,9 @@ use segments::Segments;
 use traffic::Traffic;
 use writing::Exchanges;
 
+/// An instance that no device has: instances have 22 bits.
+const NO_DEVICE: u32 = u32::MAX;
+
 /// The settings of a server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Options {
@@ -184,7 +187,8 @@ impl Server {
     }
 
     /// Serves at another address or under other numbers: clients start from scratch, apart from their writes. A write in
-    /// progress is answered, and a late duplicate is still recognised, under the present number of its device.
+    /// progress is answered, and a late duplicate is still recognised, under the present number of its device. Where that
+    /// device is gone, the rest of a request reaches no device, whichever has its number now.
     pub fn restart(&mut self, options: Options, devices: Vec<Arc<Device>>, now: Instant) {
         let bbmd = self.options.bbmd;
         let before = std::mem::replace(self, Server::new(Options { bbmd, ..options }, devices, now));
@@ -199,7 +203,7 @@ impl Server {
         (self.traffic, self.exchanges, self.jobs) = (before.traffic, before.exchanges, before.jobs);
         let of_exchanges = self.exchanges.devices();
         for device in of_exchanges.chain(self.jobs.iter_mut().map(|job| &mut job.device)) {
-            *device = numbers.get(device).copied().unwrap_or(*device);
+            *device = numbers.get(device).copied().unwrap_or(NO_DEVICE);
         }
     }
 

@@ -276,6 +276,29 @@ fn of_several_writes_a_stop_waits_for_none_and_outlives_all() {
 }
 
 #[test]
+fn the_rest_of_a_request_reaches_no_device_that_gets_the_number_of_a_removed_one() {
+    let mut rig = ServerWithClients::new();
+    let items = several(&[(REFERENCE, 50.0), (RUN, 1.0)]);
+    rig.ask(5, Some(2), 1, c::WRITE_PROPERTY_MULTIPLE, &items);
+    let reference = rig.job().unwrap();
+    assert_eq!((reference.device, reference.object), (102, REFERENCE));
+    rig.ask(6, Some(2), 1, c::WRITE_PROPERTY, &run(1, 8));
+    // The device of station 2 is gone, and that of station 1 has its number.
+    let present = vec![device(101, None, 0), device(102, Some(1), 0), device(104, Some(3), 0)];
+    rig.server.restart(options(), present, rig.now);
+    let waiting = rig.job().unwrap();
+    assert_eq!((waiting.device, waiting.place), (NO_DEVICE, usize::MAX));
+    assert!(!rig.done(&waiting, Err(Error::WRITE_ACCESS_DENIED)).is_empty());
+    let answer = rig.done(&reference, Ok(())).remove(0);
+    assert_eq!(rig.job(), None);
+    let failed = written(|w| {
+        w.raw(&[0x50, 1, 16]).open(0).enumerated(1).enumerated(31).close(0);
+        w.open(1).context_object(0, RUN).context_unsigned(1, PV.into()).close(1);
+    });
+    assert_eq!(answer, failed, "unknown object");
+}
+
+#[test]
 fn writes_under_way_are_bounded_and_stops_find_room() {
     let mut rig = ServerWithClients::new();
     let taken = (0..=255_u8).filter(|n| {
