@@ -252,13 +252,15 @@ pub async fn release(
             spec.name
         )),
         Ok(None) => {
+            vault.looked_for(&machine);
             drive.image.restore_lock.set(None);
             RestoreStage::Ended(format!(
-                "`{}` accepts commands again; the journal no longer exists",
+                "`{}` accepts commands again; no journal that can be read belongs to it",
                 spec.name
             ))
         }
         Ok(Some(aside)) => {
+            vault.looked_for(&machine);
             drive.image.restore_lock.set(None);
             tracing::warn!(
                 target: "drivegate::north::parameter_jobs", bus = %spec.bus, drive = %spec.name, source = origin.kind.name(), client = %origin.who,

@@ -91,15 +91,23 @@ pub(super) async fn concerning(
 
 /// All journals below a directory of readings.
 fn found(params: &Path) -> std::io::Result<Vec<Found>> {
-    let files = JournalFile::all(params)?.into_iter();
-    let owner = |file: &JournalFile| match file.read() {
-        Ok(Some(text)) => Some(Owner::parse(&text)),
-        Ok(None) => None,
-        Err(error) => Some(Err(error.to_string())),
+    Ok(read(params)?.into_iter().map(|(found, _)| found).collect())
+}
+
+/// All journals below a directory of readings, each with the reason why the disk does not return it, if there is one.
+fn read(params: &Path) -> std::io::Result<Vec<(Found, Option<String>)>> {
+    let journal = |file: JournalFile| {
+        let (owner, unread) = match file.read() {
+            Ok(Some(text)) => (Owner::parse(&text), None),
+            Ok(None) => return None,
+            Err(error) => {
+                let why = format!("{}: {error}", file.path().display());
+                (Err(error.to_string()), Some(why))
+            }
+        };
+        Some(((file, owner), unread))
     };
-    Ok(files
-        .filter_map(|file| owner(&file).map(|owner| (file, owner)))
-        .collect())
+    Ok(JournalFile::all(params)?.into_iter().filter_map(journal).collect())
 }
 
 /// The journals below a directory of readings that belong to no configured drive, each with the problem and the remedy.
@@ -257,10 +265,10 @@ impl Search {
             if !std::mem::replace(&mut failing, true) {
                 tracing::error!(
                     target: "drivegate::north::parameter_jobs",
-                    "cannot read the journals of restores: {why}; retrying; check the disk of state_dir"
+                    "cannot read the journals of restores: {why}; retrying; {REMEDY}"
                 );
                 for drive in self.new_drives() {
-                    let text = format!("{} ({why})", not_read(&drive.spec.name));
+                    let text = format!("{} ({why}; {REMEDY})", not_read(&drive.spec.name));
                     hold(&self.vault, &self.events, drive, text);
                 }
             }
@@ -278,11 +286,12 @@ impl Search {
     /// Locks each new drive that a journal concerns, and frees the others.
     ///
     /// # Errors
-    /// If the disk does not return all journals; contains the reason. The drives that an unread one concerns stay new.
+    /// If the disk does not return all journals; contains the reasons. Every drive without a journal of its own stays new,
+    /// because an unread one may belong to it, whatever name it had then.
     fn read_journals(&self, params: &Path) -> Result<(), String> {
         let Search { vault, events, .. } = self;
-        let journals = found(params).map_err(|error| format!("{}: {error}", params.display()))?;
-        let unread: Vec<Option<String>> = journals.iter().map(|(file, _)| error_of(file)).collect();
+        let all = read(params).map_err(|error| format!("{}: {error}", params.display()))?;
+        let (journals, unread): (Vec<Found>, Vec<Option<String>>) = all.into_iter().unzip();
         if !vault.is_last_search(self.number) {
             return Ok(());
         }
@@ -295,9 +304,13 @@ impl Search {
             .chain(others)
             .collect();
         let claims = claims(&journals, &named);
+        let is_known = |claim: Option<(usize, Claim)>| match claim {
+            Some((journal, Claim::Own)) => unread.get(journal).is_some_and(Option::is_none),
+            Some((_, Claim::Place | Claim::Name)) | None => unread.iter().all(Option::is_none),
+        };
         let claimed = self.drives.iter().zip(claims.drives);
         for (drive, claim) in claimed.filter(|(drive, _)| vault.is_new(&drive.machine)) {
-            if claim.is_some_and(|(journal, _)| unread.get(journal).is_some_and(Option::is_some)) {
+            if !is_known(claim) {
                 continue;
             }
             vault.looked_for(&drive.machine);
@@ -315,9 +328,11 @@ impl Search {
             }
         }
         self.report_orphans(claims.orphans.into_iter().filter_map(|orphan| journals.get(orphan)));
-        match unread.into_iter().flatten().next() {
-            Some(why) => Err(why),
-            None => Ok(()),
+        let unread: Vec<String> = unread.into_iter().flatten().collect();
+        if unread.is_empty() {
+            Ok(())
+        } else {
+            Err(unread.join(", "))
         }
     }
 
@@ -335,11 +350,8 @@ impl Search {
     }
 }
 
-/// Why the disk does not return a journal; `None` if it does.
-fn error_of(file: &JournalFile) -> Option<String> {
-    let error = file.read().err()?;
-    Some(format!("{}: {error}", file.path().display()))
-}
+/// What ends the lock of the drives while journals cannot be read.
+const REMEDY: &str = "check the disk of state_dir and the permissions there, or examine the journal and move it away";
 
 /// Text of the reason why a drive is locked whose journal was not read yet.
 fn not_read(name: &str) -> String {
@@ -380,3 +392,6 @@ fn why_held(spec: &DriveSpec, (file, owner): &Found, claim: Claim) -> String {
     };
     held_unfinished(name, &why)
 }
+
+#[cfg(test)]
+mod tests;
