@@ -79,8 +79,13 @@ pub trait Application {
     /// A host that may not write tried to.
     fn denied(&self, _from: &Address, _device: u32, _write: &WriteItem) {}
 
-    /// Whether a write is a stop, which passes where nothing else does.
+    /// Whether a write is a stop, which passes where nothing else does, also one to an object that the devices no longer have.
     fn stops(&self, device: u32, write: &WriteItem) -> bool;
+
+    /// The instance that the device of this station had when the datagram arrived, if no device has the station now.
+    fn formerly(&self, _station: Mac) -> Option<u32> {
+        None
+    }
 
     /// A counter of the orders to this device by any client, which changes when one is given.
     fn orders(&self, device: u32) -> u64;
@@ -200,11 +205,25 @@ impl Server {
             Some((device.instance, self.devices.get(place)?.instance))
         };
         let numbers: HashMap<u32, u32> = before.devices.iter().filter_map(number).collect();
-        (self.traffic, self.exchanges, self.jobs) = (before.traffic, before.exchanges, before.jobs);
-        let of_exchanges = self.exchanges.devices();
-        for device in of_exchanges.chain(self.jobs.iter_mut().map(|job| &mut job.device)) {
-            *device = numbers.get(device).copied().unwrap_or(NO_DEVICE);
+        // The number that a device which is gone would have, by which the application knows it.
+        let first = |devices: &[Arc<Device>]| devices.first().map(|own| own.instance);
+        let (first_before, first_now) = (first(&before.devices), first(&self.devices));
+        let gone = |device: u32| {
+            let number = device.checked_sub(first_before?)?.checked_add(first_now?)?;
+            (!self.by_instance.contains_key(&number)).then_some(number)
+        };
+        let numbered = |device: u32| {
+            numbers
+                .get(&device)
+                .copied()
+                .or_else(|| gone(device))
+                .unwrap_or(NO_DEVICE)
+        };
+        let (mut exchanges, mut jobs) = (before.exchanges, before.jobs);
+        for device in exchanges.devices().chain(jobs.iter_mut().map(|job| &mut job.device)) {
+            *device = numbered(*device);
         }
+        (self.traffic, self.exchanges, self.jobs) = (before.traffic, exchanges, jobs);
     }
 
     /// The device with this instance.

@@ -1,6 +1,7 @@
 //! Receives and sends datagrams, and answers router messages (clause 6).
 
 use std::net::{Ipv4Addr, SocketAddrV4};
+use std::sync::Arc;
 use std::time::Instant;
 
 use super::segments::Message;
@@ -8,6 +9,8 @@ use super::{Application, Delivery, Server, Source, Target};
 use crate::apdu::{self, Apdu};
 use crate::bvlc::{self, Bvlc};
 use crate::npdu::{self, GLOBAL, Payload, message};
+use crate::object::Device;
+use crate::services::confirmed;
 use crate::types::{Address, Mac};
 
 /// Reasons for refusing a message to a network.
@@ -130,7 +133,7 @@ impl Server {
                 Mac::ALL => Target::Network,
                 mac => match self.by_station.get(&mac) {
                     Some(place) => Target::Device(*place),
-                    None => return,
+                    None => return self.receive_for_removed(source, mac, npdu.payload, app, now),
                 },
             },
             // Without a virtual network the server is not a router, and only routers reject unknown networks.
@@ -141,6 +144,33 @@ impl Server {
             Payload::Application(apdu) => self.application(source, target, apdu, app, now),
             Payload::Network(kind, content) => self.between_routers(source, target, kind, content, now),
         }
+    }
+
+    /// A write to a station that no device has any more, which may stop the machine that had it.
+    fn receive_for_removed(
+        &mut self,
+        source: Source,
+        station: Mac,
+        payload: Payload<'_>,
+        app: &dyn Application,
+        now: Instant,
+    ) {
+        let (Payload::Application(bytes), Delivery::Unicast) = (payload, source.way) else {
+            return;
+        };
+        let Some(instance) = app.formerly(station) else { return };
+        let Some(Apdu::Confirmed {
+            segmented: false,
+            invoke,
+            service: service @ (confirmed::WRITE_PROPERTY | confirmed::WRITE_PROPERTY_MULTIPLE),
+            data,
+            ..
+        }) = apdu::decode(bytes)
+        else {
+            return;
+        };
+        let device = Device::new(instance, Some(station), String::new(), Default::default(), Vec::new());
+        self.write_request(source.address, &Arc::new(device), (invoke, service), data, app, now);
     }
 
     fn between_routers(&mut self, source: Source, target: Target, kind: u8, content: &[u8], now: Instant) {
@@ -251,6 +281,12 @@ impl Server {
         Some((self.options.network?, mac))
     }
 
+    /// Sends an answer of a station.
+    pub(super) fn send_as(&mut self, station: Option<(u16, Mac)>, to: Address, apdu: &[u8], now: Instant) {
+        let npdu = npdu::encode(to.remote, station, false, Payload::Application(apdu));
+        self.traffic.answer(to.host, bvlc::unicast(&npdu), now);
+    }
+
     pub(super) fn message(&self, to: Address, device: u32, apdu: &[u8], expects: bool) -> Vec<u8> {
         let payload = Payload::Application(apdu);
         bvlc::unicast(&npdu::encode(to.remote, self.station(device), expects, payload))
@@ -258,8 +294,7 @@ impl Server {
 
     /// Sends an answer of a device.
     pub(super) fn send(&mut self, to: Address, device: u32, apdu: &[u8], now: Instant) {
-        let message = self.message(to, device, apdu, false);
-        self.traffic.answer(to.host, message, now);
+        self.send_as(self.station(device), to, apdu, now);
     }
 
     pub(super) fn send_segments(&mut self, segments: Vec<Message>, now: Instant) {

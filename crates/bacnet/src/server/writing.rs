@@ -14,7 +14,7 @@ use crate::apdu;
 use crate::encoding::Writer;
 use crate::object::{Access, Datum, Device, Kind, Object};
 use crate::services::{self, PropertyRef, WriteItem, confirmed};
-use crate::types::{Address, Data, Error, ObjectId, ObjectType, PropertyId, WILDCARD};
+use crate::types::{Address, Data, Error, Mac, ObjectId, ObjectType, PropertyId, WILDCARD};
 
 /// Time for which an answer is remembered.
 const REMEMBERED: Duration = Duration::from_secs(10);
@@ -59,6 +59,8 @@ struct Exchange {
     token: u64,
     from: Address,
     device: u32,
+    /// The station that was addressed, and that answers even if no device has it any more.
+    station: Option<Mac>,
     invoke: u8,
     service: u8,
     request: Box<[u8]>,
@@ -222,6 +224,7 @@ impl Server {
             token,
             from,
             device: instance,
+            station: device.station,
             invoke,
             service,
             request: data.into(),
@@ -264,6 +267,9 @@ impl Server {
             }
             let place = (item.object, item.property);
             let step = match self.device(instance) {
+                device if is_stop && device.as_ref().is_none_or(|device| device.find(item.object).is_none()) => {
+                    stop_of_removed(&item)
+                }
                 None => Err(Error::UNKNOWN_OBJECT.into()),
                 Some(_) if !is_stop && !app.answers(instance) => Err(Error::TIMEOUT.into()),
                 Some(device) => self.step(&device, &item),
@@ -307,6 +313,7 @@ impl Server {
             Some((why, at)) => failure(invoke, service, why, at),
         };
         let (from, device, mute) = (exchange.from, exchange.device, exchange.mute);
+        let station = exchange.station;
         exchange.state = State::Done {
             answer: answer.clone(),
             at: now,
@@ -318,7 +325,8 @@ impl Server {
             self.counters.done += 1;
         }
         if !mute {
-            self.send(from, device, &answer, now);
+            let station = self.options.network.zip(station);
+            self.send_as(station, from, &answer, now);
         }
     }
 
@@ -371,6 +379,18 @@ impl Server {
             (object.access == Access::Command).then_some(priority),
         ))
     }
+}
+
+/// A stop for an object that the devices no longer have: the application knows the machine.
+fn stop_of_removed(item: &WriteItem) -> Result<Step, Failure> {
+    let value = match &item.value {
+        Some(Data::Null) => None,
+        _ => Some(Datum::Bool(false)),
+    };
+    let priority = u8::try_from(item.priority.unwrap_or(16)).ok();
+    let priority = priority.filter(|priority| (1..=16).contains(priority));
+    let priority = priority.ok_or(Error::PARAMETER_OUT_OF_RANGE)?;
+    Ok(Step::Job(usize::MAX, value, Some(priority)))
 }
 
 /// The writes in their order, with stops moved to the front unless they follow a write to another object, for which

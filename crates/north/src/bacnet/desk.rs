@@ -138,6 +138,8 @@ impl Desk {
     pub(super) fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
         self.refresh(now);
         self.view.set_time(now);
+        let of_batch = self.batch.as_ref().filter(|(at, _)| *at == now);
+        self.view.set_asked(of_batch.map_or(now, |(_, arrival)| arrival.asked));
         self.server.receive(from, datagram, &self.view, now);
     }
 
@@ -157,6 +159,8 @@ impl Desk {
 
     /// Gives the client the result of a write, or begins the next one of its request.
     fn written(&mut self, token: u64, result: Result<(), Error>, now: Instant) {
+        let arrival = self.in_progress.get(&token);
+        self.view.set_asked(arrival.map_or(now, |arrival| arrival.asked));
         self.server.written(token, result, &self.view, now);
         if !self.server.is_running(token) {
             self.in_progress.remove(&token);

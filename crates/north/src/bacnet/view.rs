@@ -8,7 +8,7 @@ use std::time::{Instant, SystemTime};
 
 use drivegate_bacnet::services::WriteItem;
 use drivegate_bacnet::{
-    Address, Application, Commands, Data, DateTime, Datum, Device, ObjectId, ObjectType, PropertyId, Reliability,
+    Address, Application, Commands, Data, DateTime, Datum, Device, Mac, ObjectId, ObjectType, PropertyId, Reliability,
     Sample, Slot, ValueSource,
 };
 use subtle::ConstantTimeEq as _;
@@ -18,7 +18,7 @@ use super::rights::HostRights;
 use super::{Options, WhenOffline};
 use drivegate_core::order::{Commanded, Entry, Origin, Refusal, SourceKind};
 use drivegate_core::permit::{self, Priorities};
-use drivegate_core::plant::{BusHandle, DriveHandle, Plant};
+use drivegate_core::plant::{BusHandle, DriveHandle, DriveKey, Plant};
 use drivegate_core::process_image::{Reading, Unavailable};
 use drivegate_model::drive::{ModelPoint, PointIndex, Quality, Source, Value};
 use drivegate_proto::Table;
@@ -47,6 +47,8 @@ pub(super) struct View {
     buses: Vec<BusHandle>,
     /// The time of this view, by the monotonic clock and by the wall clock.
     now: Cell<(Instant, SystemTime)>,
+    /// When the request that is processed arrived.
+    asked: Cell<Instant>,
 }
 
 impl View {
@@ -80,6 +82,7 @@ impl View {
             options,
             rights,
             now: Cell::new((Instant::now(), SystemTime::now())),
+            asked: Cell::new(Instant::now()),
         }
     }
 
@@ -95,6 +98,11 @@ impl View {
 
     pub(super) fn set_time(&self, now: Instant) {
         self.now.set((now, SystemTime::now()));
+    }
+
+    /// Sets when the request arrived that is processed next.
+    pub(super) fn set_asked(&self, asked: Instant) {
+        self.asked.set(asked);
     }
 
     fn wall(&self, at: Instant) -> DateTime {
@@ -120,6 +128,19 @@ impl View {
         let (unit, number) = objects::of_flat(object)?;
         let drive = self.drives.get(&(self.options.device + u32::from(unit)))?;
         Some((drive, ObjectId::new(object.kind, number)))
+    }
+
+    /// The drive to whose run command an object belonged at `asked`, if a reload has taken the number from every drive since.
+    pub(super) fn run_formerly(&self, device: u32, object: ObjectId, asked: Instant) -> Option<DriveHandle> {
+        let (unit, number) = match self.flat {
+            Some(_) => objects::of_flat(object)?,
+            None => (
+                u8::try_from(device.checked_sub(self.options.device)?).ok()?,
+                object.instance,
+            ),
+        };
+        let is_run = ObjectId::new(object.kind, number) == RUN;
+        is_run.then(|| self.plant.drive_formerly(&DriveKey::Unit(unit), asked))?
     }
 
     fn meaning(&self, device: u32, place: usize) -> Option<Meaning> {
@@ -396,7 +417,10 @@ impl Application for View {
     }
 
     fn stops(&self, device: u32, write: &WriteItem) -> bool {
-        let Some((drive, object)) = self.owner(device, write.object) else {
+        let former = || Some((self.run_formerly(device, write.object, self.asked.get())?, RUN));
+        let owner = self.owner(device, write.object);
+        let owner = owner.map(|(drive, object)| (drive.handle.clone(), object));
+        let Some((drive, object)) = owner.or_else(former) else {
             return false;
         };
         let is_run = object == RUN && write.property.property == PropertyId::PRESENT_VALUE;
@@ -406,7 +430,13 @@ impl Application for View {
             _ => return false,
         };
         let priority = write.priority.unwrap_or(16);
-        u8::try_from(priority).is_ok_and(|priority| is_run && drive.handle.priorities(|all| all.stops(priority, value)))
+        u8::try_from(priority).is_ok_and(|priority| is_run && drive.priorities(|all| all.stops(priority, value)))
+    }
+
+    fn formerly(&self, station: Mac) -> Option<u32> {
+        let [unit] = station.octets() else { return None };
+        self.plant.drive_formerly(&DriveKey::Unit(*unit), self.asked.get())?;
+        Some(self.options.device + u32::from(*unit))
     }
 
     fn orders(&self, device: u32) -> u64 {

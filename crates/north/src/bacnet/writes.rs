@@ -51,10 +51,12 @@ pub(super) fn origin(rights: &HostRights, from: &Address, priority: Option<u8>) 
 
 /// Starts a write whose request arrived at this time.
 pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> JobProgress {
-    let Some((handle, meaning)) = view.of_drive(job.device, job.place) else {
-        return JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED));
-    };
     let origin = origin(&view.rights, &job.from, job.priority);
+    let Some((handle, meaning)) = view.of_drive(job.device, job.place) else {
+        let stop = view.run_formerly(job.device, job.object, arrival.asked);
+        let stop = stop.and_then(|drive| stop_formerly(&drive, job, origin, arrival, now));
+        return stop.unwrap_or(JobProgress::Answered(Err(Error::UNKNOWN_OBJECT)));
+    };
     let expiry = expiry(job);
     // A reload may have happened since the request was received, or between two of its writes.
     if let Err(refusal) = client_access(Stage::Accept, false, &origin, &handle.image.spec.bus) {
@@ -83,6 +85,38 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> J
         (Meaning::Slot(what, index), _) => slot(handle, what, index, job, origin, arrival, now),
         _ => JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED)),
     }
+}
+
+/// A write of `run` to a number that no drive has any more: a stop by the slots of the machine that had it is carried out
+/// there; `None` for anything else.
+fn stop_formerly(
+    drive: &DriveHandle,
+    job: &Job,
+    origin: Origin,
+    arrival: Arrival,
+    now: Instant,
+) -> Option<JobProgress> {
+    let value = match &job.value {
+        None => None,
+        Some(Datum::Bool(on)) => Some(*on),
+        Some(_) => return None,
+    };
+    let priority = job.priority.unwrap_or(LOWEST);
+    if !drive.priorities(|all| all.stops(priority, value)) {
+        return None;
+    }
+    if let Err(refusal) = client_access(Stage::Accept, true, &origin, &drive.image.spec.bus) {
+        drive.refuse(&described(job), refusal, origin, now);
+        return Some(JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED)));
+    }
+    let run = drive.image.spec.profile.model_index(Commanded::Run.point())?;
+    let order = Order::Points(vec![(run, Value::Bool(false))]);
+    let request = OrderRequest::new(order, origin, Authority::Write).within(expiry(job));
+    Some(waits(
+        drive,
+        drive.place(request.arrived(arrival).resolved(), now),
+        None,
+    ))
 }
 
 /// A write whose device number meant another machine when its request arrived: it enters no slot. What was a stop by the

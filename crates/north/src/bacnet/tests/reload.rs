@@ -10,7 +10,7 @@ use drivegate_bacnet::{Mac, To, bvlc};
 use drivegate_core::plant::{BusHandle, SharedPlant, UnusedNames};
 use drivegate_testkit::up;
 
-use super::super::desk::Desk;
+use super::super::desk::{Desk, Ended};
 use super::*;
 
 const HOST: SocketAddrV4 = SocketAddrV4::new(std::net::Ipv4Addr::new(127, 0, 0, 5), 47808);
@@ -23,28 +23,63 @@ struct Reloads {
     now: Instant,
 }
 
-/// A bus with drives at these addresses, units 1, 2, …; the output frequency of each is its address in Hz.
-fn bus_of(addresses: &[u8], now: Instant) -> BusHandle {
-    let drive = |(unit, address): (u8, &u8)| {
+/// A bus with drives that have these units and addresses; the output frequency of each is its address in Hz.
+fn bus_with(drives: impl Iterator<Item = (u8, u8)>, now: Instant) -> BusHandle {
+    let drive = |(unit, address): (u8, u8)| {
         let image = image(DriveSpec {
             unit,
-            address: *address,
+            address,
             name: format!("p{address}"),
             ..spec("vacon-nx")
         });
-        read_all(&image, now, |_| u16::from(*address) * 100);
+        read_all(&image, now, |_| u16::from(address) * 100);
         image
     };
-    up(bus(bus_spec("line1"), (1..).zip(addresses).map(drive).collect()))
+    up(bus(bus_spec("line1"), drives.map(drive).collect()))
+}
+
+/// The datagram with this APDU for the device of a unit, or for that of the host.
+fn datagram(unit: Option<u8>, apdu: &[u8]) -> Vec<u8> {
+    let to = unit.map(|unit| (1001, Mac::new(&[unit]).unwrap()));
+    bvlc::unicast(&npdu::encode(to, None, true, Payload::Application(apdu)))
+}
+
+/// Station of the sender, and APDU.
+fn opened(datagram: &[u8]) -> (Option<(u16, Mac)>, Vec<u8>) {
+    let Some(bvlc::Bvlc::Unicast(npdu)) = bvlc::decode(datagram) else {
+        panic!("{datagram:?}")
+    };
+    let npdu = npdu::decode(npdu).unwrap();
+    let Payload::Application(apdu) = npdu.payload else {
+        panic!("{datagram:?}")
+    };
+    (npdu.from, apdu.to_vec())
+}
+
+/// The APDU of a WritePropertyMultiple of run commands at priority 8.
+fn runs_at_8(runs: &[(u32, bool)]) -> Vec<u8> {
+    let mut writer = Writer::default();
+    writer.raw(&[0x00, 0x05, 1, 16]);
+    for (number, on) in runs {
+        let run = ObjectId::new(ObjectType::BINARY_VALUE, *number);
+        writer.context_object(0, run).open(1).context_unsigned(0, 85);
+        writer.open(2).enumerated((*on).into()).close(2);
+        writer.context_unsigned(3, 8).close(1);
+    }
+    writer.into_bytes()
 }
 
 impl Reloads {
     fn new() -> Reloads {
+        Reloads::of(options())
+    }
+
+    fn of(options: Options) -> Reloads {
         let now = Instant::now();
-        let plant = Plant::new("hall", STALE_AFTER, vec![bus_of(&[1, 2], now)]);
+        let plant = Plant::new("hall", STALE_AFTER, vec![bus_with([(1, 1), (2, 2)].into_iter(), now)]);
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let mut reloads = Reloads {
-            server: Loopback::new(options(), plant.clone(), now),
+            server: Loopback::new(options, plant.clone(), now),
             unused: UnusedNames::default(),
             plant,
             now,
@@ -54,9 +89,19 @@ impl Reloads {
         reloads
     }
 
+    /// Gives units 1, 2, … to the drives at these addresses.
     fn reload(&mut self, addresses: &[u8]) {
+        self.replace_bus((1..).zip(addresses.iter().copied()));
+    }
+
+    /// Gives the drive at address 2 unit 3; no drive has unit 2 any more.
+    fn move_the_second(&mut self) {
+        self.replace_bus([(1, 1), (3, 2)].into_iter());
+    }
+
+    fn replace_bus(&mut self, drives: impl Iterator<Item = (u8, u8)>) {
         self.now += Duration::from_millis(10);
-        let (before, next) = (self.plant.load_full(), bus_of(addresses, self.now));
+        let (before, next) = (self.plant.load_full(), bus_with(drives, self.now));
         next.take_over(&before.buses, self.now);
         let after = vec![next];
         self.unused.follow(&before.buses, &after, self.now);
@@ -77,17 +122,8 @@ impl Reloads {
         writer.context_object(0, object).context_unsigned(1, 85);
         content(&mut writer);
         let apdu = [&[0x00, 0x05, 1, service][..], &writer.into_bytes()].concat();
-        let to = Some((1001, Mac::new(&[unit]).unwrap()));
-        let datagram = bvlc::unicast(&npdu::encode(to, None, true, Payload::Application(&apdu)));
-        self.server.receive(HOST, &datagram, self.now);
-        let datagram = self.sent().pop()?;
-        let Some(bvlc::Bvlc::Unicast(npdu)) = bvlc::decode(&datagram) else {
-            panic!("{datagram:?}")
-        };
-        let Payload::Application(apdu) = npdu::decode(npdu).unwrap().payload else {
-            panic!("{datagram:?}")
-        };
-        Some(apdu.to_vec())
+        self.server.receive(HOST, &datagram(Some(unit), &apdu), self.now);
+        Some(opened(&self.sent().pop()?).1)
     }
 
     fn run_at_8(&mut self, unit: u8, on: bool) -> Option<Vec<u8>> {
@@ -294,4 +330,89 @@ fn leases_are_counted_by_machine() {
     plant.drive("p2").image.count_supervision();
     desk.poll(plant.now);
     assert!(!stands(&plant));
+}
+
+#[test]
+fn the_later_stops_of_a_request_go_to_their_machines_under_whatever_number() {
+    let flat = Options {
+        network: None,
+        ..options()
+    };
+    let second = Mac::new(&[2]).map(|station| (1001, station));
+    // Both drives in the single device, where the last stop goes first; the second one as a device, with a start before its
+    // stop.
+    let requests = [
+        (flat, None, [(2001, false), (1001, false)], (1, false), None),
+        (options(), Some(2), [(1, true), (1, false)], (2, true), second),
+    ];
+    for (options, unit, runs, first, station) in requests {
+        let mut plant = Reloads::of(options);
+        plant
+            .server
+            .receive(HOST, &datagram(unit, &runs_at_8(&runs)), plant.now);
+        let bus = plant.plant.load().buses[0].clone();
+        let on_the_line = take_next(&bus.queue, plant.now).expect("an order");
+        let address = bus.image.drives.get(on_the_line.drive().unwrap()).unwrap().spec.address;
+        assert_eq!((address, !on_the_line.is_stop()), first);
+        plant.move_the_second();
+        on_the_line.answer(&done(), plant.now);
+        plant.server.collect(plant.now);
+        assert_eq!(plant.sent(), Vec::<Vec<u8>>::new());
+        assert_eq!(plant.carried_out(), Some((2, false)));
+        plant.server.collect(plant.now);
+        let sent = plant.sent();
+        assert_eq!(
+            sent.iter().map(|sent| opened(sent)).collect::<Vec<_>>(),
+            [(station, vec![0x20, 1, 16])]
+        );
+    }
+}
+
+#[test]
+fn to_a_number_that_no_drive_has_now_only_a_stop_from_before_is_carried_out() {
+    let flat = Options {
+        network: None,
+        ..options()
+    };
+    for (options, unit, run) in [(options(), Some(2), 1), (flat, None, 2001)] {
+        let mut plant = Reloads::new();
+        let (rights, at) = (HostRights::new(&options), (options.listen, 8));
+        let mut desk = Desk::new(Arc::new(options), rights, plant.plant.clone(), at, plant.now);
+        let before = plant.now;
+        plant.move_the_second();
+        for (asked, on, stops) in [(before, true, false), (before, false, true), (plant.now, false, false)] {
+            desk.received(Arrival::now(asked), plant.now);
+            desk.receive(HOST, &datagram(unit, &runs_at_8(&[(run, on)])), plant.now);
+            let waiting = desk.next_order(plant.now);
+            assert_eq!(waiting.is_some(), stops, "{unit:?} {on}");
+            assert_eq!(plant.carried_out(), stops.then_some((2, false)), "{unit:?} {on}");
+            if let Some((token, mut waiting)) = waiting {
+                assert_eq!(waiting.slot, None);
+                let outcome = waiting.placed.answer().unwrap().outcome;
+                desk.ended(&Ended::of(token, waiting, outcome), plant.now);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_later_stop_goes_to_its_machine_although_the_numbers_have_changed() {
+    let mut plant = Reloads::new();
+    let (rights, at) = (HostRights::new(&options()), (options().listen, 8));
+    let mut desk = Desk::new(Arc::new(options()), rights.clone(), plant.plant.clone(), at, plant.now);
+    let request = datagram(Some(2), &runs_at_8(&[(1, true), (1, false)]));
+    desk.receive(HOST, &request, plant.now);
+    let (token, mut waiting) = desk.next_order(plant.now).expect("the start");
+    assert_eq!(plant.carried_out(), Some((2, true)));
+    // The drive with unit 1 gets number 102.
+    let renumbered = Options {
+        device: 101,
+        ..options()
+    };
+    rights.set(Some(&renumbered));
+    plant.move_the_second();
+    let outcome = waiting.placed.answer().unwrap().outcome;
+    desk.ended(&Ended::of(token, waiting, outcome), plant.now);
+    assert!(desk.next_order(plant.now).is_some());
+    assert_eq!((plant.carried_out(), plant.carried_out()), (Some((2, false)), None));
 }
