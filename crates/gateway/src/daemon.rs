@@ -375,6 +375,7 @@ impl Daemon {
     /// Makes these buses the present plant.
     fn show(&self, settings: &Settings, buses: &[(BusSettings, BusTask)]) {
         self.watch(buses);
+        drivegate_mqtt::Handover::of(&self.north).plant_ends(&self.plant.load(), Instant::now());
         self.plant.store(Arc::new(Plant {
             gateway: settings.gateway.clone(),
             stale_after: settings.stale_after.limit,

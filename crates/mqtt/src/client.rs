@@ -159,7 +159,7 @@ impl PlainClient {
             topics.clone(),
             rules,
             Handover::of(stats).commands.clone(),
-            stats.stop_all.clone(),
+            (stats.stop_all.clone(), Handover::of(stats).earlier_names.clone()),
             orders,
         );
         let mut client = PlainClient {

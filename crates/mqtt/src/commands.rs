@@ -10,6 +10,7 @@ use std::time::{Instant, SystemTime};
 
 use tokio::sync::oneshot;
 
+use super::earlier_names::EarlierNames;
 use super::outbox::Message;
 use super::reply::{Reply, ResponseTopics};
 use super::request::{self, Incoming};
@@ -46,6 +47,7 @@ pub(super) struct Commands {
     stopping: Vec<PendingStop>,
     memory: SharedMemory,
     stop_all: Arc<StopAll>,
+    earlier_names: Arc<EarlierNames>,
     rules: Rules,
     /// Number of stops whose results are not awaited, since the last [`Commands::take_unfollowed`].
     unfollowed: u64,
@@ -103,7 +105,7 @@ impl Commands {
         topics: Topics,
         rules: Rules,
         memory: SharedMemory,
-        stop_all: Arc<StopAll>,
+        (stop_all, earlier_names): (Arc<StopAll>, Arc<EarlierNames>),
         left: Option<OrdersLeft>,
     ) -> Commands {
         if left.is_none() {
@@ -118,6 +120,7 @@ impl Commands {
             stopping: left.stopping,
             memory,
             stop_all,
+            earlier_names,
             rules,
             unfollowed: 0,
         }
@@ -268,7 +271,13 @@ impl Commands {
         if let Err(refusal) = access(Stage::Accept, true, self.rules.right.allows("")) {
             return refuse(refusal);
         }
-        match self.stop_all.order(plant, &scope, origin, wait, now) {
+        // A reload since the first byte may have given the name to other drives.
+        let asked = incoming.arrival.as_ref().map(|arrival| arrival.asked);
+        let scope = match asked.and_then(|asked| self.earlier_names.at(asked)) {
+            Some(earlier) => scope.as_of(&earlier),
+            None => Ok(scope),
+        };
+        match scope.and_then(|scope| self.stop_all.order(plant, &scope, origin, wait, now)) {
             Ok(order) => {
                 let report = order.report;
                 self.stopping.push(PendingStop { reply, report });

@@ -1,15 +1,18 @@
 //! State that a client leaves to the client that replaces it at a reload.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
 
 use tokio::sync::broadcast::Receiver;
 
 use super::Broker;
 use super::commands::OrdersLeft;
+use super::earlier_names::EarlierNames;
 use super::rights::BrokerRights;
 use super::sparkplug::NodeOrdersLeft;
 use super::store::Writer;
 use drivegate_core::event::Event;
+use drivegate_core::plant::Plant;
 use drivegate_north::NorthState;
 use drivegate_north::command_json::SharedMemory;
 
@@ -22,6 +25,8 @@ pub struct Handover {
     pub(super) rights: BrokerRights,
     /// Recent commands that came from the broker, to recognise repetitions.
     pub(super) commands: SharedMemory,
+    /// What names meant before reloads.
+    pub(super) earlier_names: Arc<EarlierNames>,
 }
 
 #[derive(Debug, Default)]
@@ -69,6 +74,11 @@ impl Handover {
     /// Leaves these events to the next client.
     pub fn leave_events(&self, events: Receiver<Arc<Event>>) {
         self.lock().unread = Some(events);
+    }
+
+    /// Notes that another plant replaces this one at `now`: what arrived before means what names meant in it.
+    pub fn plant_ends(&self, plant: &Plant, now: Instant) {
+        self.earlier_names.ended(plant, now);
     }
 
     /// Discards the state of the last clients if no client takes it over; the retained topics still have to be cleared,

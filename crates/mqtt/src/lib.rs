@@ -25,6 +25,7 @@ mod client;
 mod commands;
 mod connection;
 mod dial;
+mod earlier_names;
 #[cfg(test)]
 mod fixture;
 mod handover;

@@ -59,7 +59,7 @@ impl Loopback {
                 Topics::new(base, &gateway),
                 rules,
                 SharedMemory::default(),
-                std::sync::Arc::default(),
+                Default::default(),
                 None,
             ),
             results: Vec::new(),

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 use tokio::sync::{Notify, oneshot};
 
-pub use self::scope::{NothingToStop, Scope};
+pub use self::scope::{NamedDrives, NothingToStop, Scope};
 
 pub(crate) use self::one_stop::OneStop;
 use self::stop_of_line::stop_of_line;

@@ -18,6 +18,32 @@ pub enum Scope {
     Machines(Vec<Machine>),
 }
 
+/// What the names of buses and groups mean in a plant. A plant that a reload replaced is not kept for them: it would keep
+/// its buses, which others take for served.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NamedDrives(Vec<NamedDrive>);
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct NamedDrive {
+    machine: Machine,
+    bus: String,
+    group: Option<String>,
+    is_controlled: bool,
+}
+
+impl NamedDrives {
+    /// The meanings in this plant.
+    pub fn of(plant: &Plant) -> NamedDrives {
+        let named = |drive: DriveHandle| NamedDrive {
+            machine: drive.machine(),
+            bus: drive.image.spec.bus.clone(),
+            group: drive.image.spec.group.clone(),
+            is_controlled: drive.image.spec.access == Access::Control,
+        };
+        NamedDrives(plant.drives().map(named).collect())
+    }
+}
+
 /// Why a command to stop all has no drives.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NothingToStop {
@@ -37,18 +63,33 @@ pub enum NothingToStop {
 }
 
 impl Scope {
-    /// The scope of a request that began when the plant was `earlier`: the name of a bus or group stands for the machines
-    /// that it meant then.
+    /// The scope of a request that began when names had the meanings of `earlier`: the name of a bus or group stands for the
+    /// machines that it meant then.
     ///
     /// # Errors
     /// If the name meant no drives then.
-    pub fn as_of(self, earlier: &Plant) -> Result<Scope, NothingToStop> {
-        match self {
-            Scope::Bus(_) | Scope::Group(_) => {
-                let drives = self.drives(earlier)?;
-                Ok(Scope::Machines(drives.iter().map(DriveHandle::machine).collect()))
-            }
+    pub fn as_of(self, earlier: &NamedDrives) -> Result<Scope, NothingToStop> {
+        let drives = &earlier.0;
+        let is_named = |drive: &&NamedDrive| match &self {
+            Scope::Bus(name) => drive.bus == *name,
+            Scope::Group(name) => drive.group.as_ref() == Some(name),
+            Scope::Gateway | Scope::Buses(_) | Scope::Machines(_) => false,
+        };
+        let named: Vec<&NamedDrive> = drives.iter().filter(is_named).collect();
+        let controlled = named.iter().filter(|drive| drive.is_controlled);
+        let machines: Vec<Machine> = controlled.map(|drive| drive.machine.clone()).collect();
+        match &self {
             Scope::Gateway | Scope::Buses(_) | Scope::Machines(_) => Ok(self),
+            Scope::Bus(name) if named.is_empty() => {
+                Err(unknown("bus", name, drives.iter().map(|drive| drive.bus.clone())))
+            }
+            Scope::Group(name) if named.is_empty() => Err(unknown(
+                "group",
+                name,
+                drives.iter().filter_map(|drive| drive.group.clone()),
+            )),
+            Scope::Bus(_) | Scope::Group(_) if machines.is_empty() => Err(NothingToStop::NotControlled),
+            Scope::Bus(_) | Scope::Group(_) => Ok(Scope::Machines(machines)),
         }
     }
 
@@ -65,20 +106,14 @@ impl Scope {
                 drives.push(drive);
             }
         }
-        let unknown = |kind, name: &String, mut known: Vec<String>| {
-            known.sort();
-            known.dedup();
-            let name = name.clone();
-            NothingToStop::Unknown { kind, name, known }
-        };
         match (self, found, drives.is_empty()) {
             (Scope::Bus(name), false, _) => {
                 let buses = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
-                Err(unknown("bus", name, buses.collect()))
+                Err(unknown("bus", name, buses))
             }
             (Scope::Group(name), false, _) => {
                 let groups = plant.drives().filter_map(|drive| drive.image.spec.group.clone());
-                Err(unknown("group", name, groups.collect()))
+                Err(unknown("group", name, groups))
             }
             (_, _, true) => Err(NothingToStop::NotControlled),
             _ => Ok(drives),
@@ -95,4 +130,12 @@ impl Scope {
             Scope::Machines(machines) => machines.contains(&drive.machine()),
         }
     }
+}
+
+fn unknown(kind: &'static str, name: &str, known: impl Iterator<Item = String>) -> NothingToStop {
+    let mut known: Vec<String> = known.collect();
+    known.sort();
+    known.dedup();
+    let name = name.to_string();
+    NothingToStop::Unknown { kind, name, known }
 }

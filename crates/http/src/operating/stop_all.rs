@@ -15,7 +15,7 @@ use super::super::replies::{Replied, not_found, refused};
 use super::asker::Ordered;
 use drivegate_core::order::Refusal;
 use drivegate_core::plant::Plant;
-use drivegate_core::stop_all::NothingToStop;
+use drivegate_core::stop_all::{NamedDrives, NothingToStop};
 use drivegate_north::command_json::{nothing_to_stop, refuse_stop_all, stop_all};
 
 /// The plant when the head of a request had arrived.
@@ -43,7 +43,7 @@ pub(crate) async fn stop(
     let scope = if Arc::ptr_eq(&earlier, &plant) {
         Ok(scope)
     } else {
-        scope.as_of(&earlier)
+        scope.as_of(&NamedDrives::of(&earlier))
     };
     let order = scope.and_then(|scope| app.north.stop_all.order(&plant, &scope, &origin, wait, now));
     let order = order.map_err(|why| match (refuse(nothing_to_stop(&why)), why) {

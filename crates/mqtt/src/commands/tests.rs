@@ -41,13 +41,14 @@ impl SetTopics {
 
     /// Replaces the client, as a reload does; the new client continues with the state that the old client left.
     fn succeed_client(&mut self) {
+        let earlier_names = self.commands.earlier_names.clone();
         let after = |left| {
             let topics = Topics::new("drivegate", "hall");
             Commands::new(
                 topics,
                 rules(false),
                 self.memory.clone(),
-                self.stop_all.clone(),
+                (self.stop_all.clone(), earlier_names.clone()),
                 Some(left),
             )
         };
@@ -103,7 +104,7 @@ fn commands(memory: &SharedMemory, stop_all: &Arc<StopAll>) -> Commands {
         Topics::new("drivegate", "hall"),
         rules(false),
         memory.clone(),
-        stop_all.clone(),
+        (stop_all.clone(), Arc::default()),
         None,
     )
 }

@@ -1,6 +1,9 @@
 //! Stop all over MQTT.
 
 use super::*;
+use drivegate_core::plant::Plant;
+use drivegate_core::process_image::DriveSpec;
+use drivegate_testkit::{STALE_AFTER, bus, bus_spec, controlled, image, nx, take_next, up};
 
 fn stop(payload: &str) -> Incoming {
     Incoming {
@@ -144,6 +147,63 @@ fn retained_messages_are_refused_and_told() {
                 (drivegate_core::event::EventKind::RefusedCommand, drive)
             );
             assert!(event.text.contains("retained"), "{}", event.text);
+        }
+    }
+}
+
+/// A bus with drives `p1` and `p2` at addresses 1 and 2, in these groups.
+fn grouped(groups: [Option<&str>; 2]) -> Plant {
+    let profile = nx();
+    let drive = |(group, address): (Option<&str>, u8)| {
+        image(DriveSpec {
+            group: group.map(str::to_string),
+            ..controlled(&format!("p{address}"), "line1", address, &profile)
+        })
+    };
+    let drives = groups.into_iter().zip(1..).map(drive);
+    Plant::new("hall", STALE_AFTER, vec![up(bus(bus_spec("line1"), drives.collect()))])
+}
+
+#[test]
+fn a_group_is_what_it_was_when_the_first_byte_came() {
+    let (fans, pumps) = (Some("fans"), Some("pumps"));
+    let refused = "there is no group `fans`";
+    // Groups before and after a reload, when the first byte came in ms from it, and the stopped drive or the refusal.
+    for (before, after, came, stopped) in [
+        ([fans, None], [None, fans], -1, Ok("p1")),
+        ([fans, None], [None, fans], 1, Ok("p2")),
+        ([fans, pumps], [pumps, None], -1, Ok("p1")),
+        ([fans, pumps], [pumps, None], 1, Err(refused)),
+        ([None, pumps], [pumps, fans], -1, Err(refused)),
+    ] {
+        let mut bench = SetTopics::new();
+        let began = bench.now;
+        bench.now += Duration::from_millis(10);
+        bench.plant = grouped(before);
+        bench.commands.earlier_names.ended(&bench.plant, bench.now);
+        bench.plant = grouped(after);
+        let asked = began + Duration::from_millis(10u64.saturating_add_signed(came));
+        bench.now += Duration::from_millis(10);
+        let message = Incoming {
+            arrival: Some(Arrival::now(asked)),
+            ..stop("{\"group\": \"fans\"}")
+        };
+        let told = bench.take(message).as_ref().map(json);
+        let what = format!("{before:?}, then {after:?}, asked at {came}: {told:?}");
+        match stopped {
+            Ok(name) => {
+                assert!(told.is_none() && bench.queued() == 1, "{what}");
+                let drive = bench.plant.drive(name).unwrap();
+                let order = take_next(&drive.bus.queue, bench.now).expect("a stop");
+                assert!(order.is_stop() && order.drive() == Some(drive.index), "{what}");
+            }
+            Err(why) => {
+                let text = told.as_ref().and_then(|told| told["error"].as_str());
+                assert!(
+                    text.is_some_and(|text| text.contains(why)) && bench.queued() == 0,
+                    "{what}"
+                );
+            }
         }
     }
 }
