@@ -20,8 +20,8 @@ pub use self::scope::{NamedDrives, NothingToStop, Scope};
 
 pub(crate) use self::one_stop::OneStop;
 use self::stop_of_line::stop_of_line;
-use crate::order::Origin;
-use crate::plant::{BusHandle, DriveHandle, Exchange, Plant, Question};
+use crate::order::{Origin, Outcome, Refusal};
+use crate::plant::{BusHandle, DriveHandle, Exchange, Plant, Question, turn_away};
 use crate::process_image::{Access, Machine, Standstill};
 
 /// Default time after which a command is answered even if not every drive is at standstill.
@@ -64,7 +64,7 @@ pub struct StoppedDrive {
 pub struct StopReport {
     /// Whether every motor is known to stand.
     pub ok: bool,
-    /// All drives that were to be stopped, in the order of the configuration.
+    /// All drives that were to be stopped, in the order of the configuration; last those that a reload took out of reach.
     pub drives: Vec<StoppedDrive>,
 }
 
@@ -124,18 +124,23 @@ impl StopAll {
         wait: Duration,
         now: Instant,
     ) -> Result<StopOrder, NothingToStop> {
-        let drives = scope.drives(plant)?;
+        let (drives, lost) = (scope.drives(plant)?, scope.lost(plant));
+        let of_present = drives.iter().map(DriveHandle::machine);
+        let machines = of_present
+            .chain(lost.iter().map(|(machine, ..)| machine.clone()))
+            .collect();
         let origin = &origin.clone().insisting().lasting();
         let (acknowledged, acknowledgement) = oneshot::channel();
         let (report, reported) = oneshot::channel();
         let mut state = self.state();
         state.place(plant, &drives, origin, now);
+        lost.into_iter().for_each(|lost| state.miss(plant, lost, origin, now));
         if state.orders.len() >= MOST_ORDERS {
             let oldest = state.orders.remove(0);
             state.answer(oldest, plant, now);
         }
         state.orders.push(UnderWay {
-            machines: drives.iter().map(DriveHandle::machine).collect(),
+            machines,
             until: now + wait.min(LONGEST_WAIT),
             acknowledged: Some(acknowledged),
             report,
@@ -196,6 +201,16 @@ impl State {
             if !joins.contains(&machine) {
                 self.stops.push(OneStop::place(drive, machine, origin, now));
             }
+        }
+    }
+
+    /// Notes a machine that was to be stopped and is out of reach, so that the report names it.
+    fn miss(&mut self, plant: &Plant, lost: (Machine, String, Refusal), origin: &Origin, now: Instant) {
+        let (machine, name, refusal) = lost;
+        let outcome = Outcome::Refused(refusal.clone());
+        turn_away(&plant.command_log, &name, "run=false", outcome, origin.clone(), now);
+        if !self.stops.iter().any(|stop| stop.machine == machine) {
+            self.stops.push(OneStop::refused(machine, name, origin, &refusal));
         }
     }
 

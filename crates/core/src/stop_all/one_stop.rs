@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::{Stopped, StoppedDrive};
-use crate::order::{Answer, Authority, Order, Origin, Outcome};
+use crate::order::{Answer, Authority, Order, Origin, Outcome, Refusal};
 use crate::plant::{DriveHandle, OrderRequest, Placed, Plant};
 use crate::process_image::{Machine, Standstill};
 use drivegate_model::drive::{ModelPoint, Value};
@@ -47,9 +47,23 @@ enum Step {
 impl OneStop {
     /// Gives the drive its stop.
     pub(crate) fn place(drive: &DriveHandle, machine: Machine, origin: &Origin, now: Instant) -> OneStop {
-        let mut stop = OneStop {
+        let mut stop = OneStop::unsent(machine, drive.image.spec.name.clone(), origin);
+        stop.try_at(drive, now);
+        stop
+    }
+
+    /// The stop of a drive of that name, which cannot be given to it.
+    pub(super) fn refused(machine: Machine, drive: String, origin: &Origin, refusal: &Refusal) -> OneStop {
+        OneStop {
+            failed: Some(refusal.to_string()),
+            ..OneStop::unsent(machine, drive, origin)
+        }
+    }
+
+    fn unsent(machine: Machine, drive: String, origin: &Origin) -> OneStop {
+        OneStop {
             machine,
-            drive: drive.image.spec.name.clone(),
+            drive,
             // A stop in progress is completed even if a reload removes the client's right.
             origin: origin.clone().lasting(),
             step: Step::Refused,
@@ -58,9 +72,7 @@ impl OneStop {
             stood: false,
             restarted: false,
             last_starter: 0,
-        };
-        stop.try_at(drive, now);
-        stop
+        }
     }
 
     fn try_at(&mut self, drive: &DriveHandle, now: Instant) {

@@ -1,5 +1,6 @@
 //! The drives that a command to stop all includes.
 
+use crate::order::Refusal;
 use crate::plant::{DriveHandle, Plant};
 use crate::process_image::{Access, Machine};
 
@@ -14,8 +15,14 @@ pub enum Scope {
     Buses(Vec<String>),
     /// All drives with this `group`.
     Group(String),
-    /// These machines, whatever their names are.
-    Machines(Vec<Machine>),
+    /// The machines that a bus or group meant when the request began, with their names then.
+    Meant {
+        /// The part of the message if none of them is left.
+        kind: &'static str,
+        /// Name of the bus or group.
+        name: String,
+        drives: Vec<(Machine, String)>,
+    },
 }
 
 /// What the names of buses and groups mean in a plant. A plant that a reload replaced is not kept for them: it would keep
@@ -26,6 +33,7 @@ pub struct NamedDrives(Vec<NamedDrive>);
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct NamedDrive {
     machine: Machine,
+    name: String,
     bus: String,
     group: Option<String>,
     is_controlled: bool,
@@ -36,6 +44,7 @@ impl NamedDrives {
     pub fn of(plant: &Plant) -> NamedDrives {
         let named = |drive: DriveHandle| NamedDrive {
             machine: drive.machine(),
+            name: drive.image.spec.name.clone(),
             bus: drive.image.spec.bus.clone(),
             group: drive.image.spec.group.clone(),
             is_controlled: drive.image.spec.access == Access::Control,
@@ -50,7 +59,7 @@ pub enum NothingToStop {
     /// No bus or group has this name.
     #[error("there is no {kind} `{name}`, so no stop was sent; known: {}", .known.join(", "))]
     Unknown {
-        /// Kind of the name: `bus` or `group`.
+        /// What has the name: `bus`, `group`, or the drives left of them.
         kind: &'static str,
         /// The name that was requested.
         name: String,
@@ -69,28 +78,31 @@ impl Scope {
     /// # Errors
     /// If the name meant no drives then.
     pub fn as_of(self, earlier: &NamedDrives) -> Result<Scope, NothingToStop> {
-        let drives = &earlier.0;
+        let all = &earlier.0;
         let is_named = |drive: &&NamedDrive| match &self {
             Scope::Bus(name) => drive.bus == *name,
             Scope::Group(name) => drive.group.as_ref() == Some(name),
-            Scope::Gateway | Scope::Buses(_) | Scope::Machines(_) => false,
+            Scope::Gateway | Scope::Buses(_) | Scope::Meant { .. } => false,
         };
-        let named: Vec<&NamedDrive> = drives.iter().filter(is_named).collect();
+        let named: Vec<&NamedDrive> = all.iter().filter(is_named).collect();
         let controlled = named.iter().filter(|drive| drive.is_controlled);
-        let machines: Vec<Machine> = controlled.map(|drive| drive.machine.clone()).collect();
-        match &self {
-            Scope::Gateway | Scope::Buses(_) | Scope::Machines(_) => Ok(self),
+        let drives: Vec<(Machine, String)> = controlled
+            .map(|drive| (drive.machine.clone(), drive.name.clone()))
+            .collect();
+        let (kind, name) = match self {
             Scope::Bus(name) if named.is_empty() => {
-                Err(unknown("bus", name, drives.iter().map(|drive| drive.bus.clone())))
+                return Err(unknown("bus", &name, all.iter().map(|drive| drive.bus.clone())));
             }
-            Scope::Group(name) if named.is_empty() => Err(unknown(
-                "group",
-                name,
-                drives.iter().filter_map(|drive| drive.group.clone()),
-            )),
-            Scope::Bus(_) | Scope::Group(_) if machines.is_empty() => Err(NothingToStop::NotControlled),
-            Scope::Bus(_) | Scope::Group(_) => Ok(Scope::Machines(machines)),
-        }
+            Scope::Group(name) if named.is_empty() => {
+                let groups = all.iter().filter_map(|drive| drive.group.clone());
+                return Err(unknown("group", &name, groups));
+            }
+            Scope::Bus(_) | Scope::Group(_) if drives.is_empty() => return Err(NothingToStop::NotControlled),
+            Scope::Bus(name) => ("controlled drive left of the bus", name),
+            Scope::Group(name) => ("controlled drive left of the group", name),
+            Scope::Gateway | Scope::Buses(_) | Scope::Meant { .. } => return Ok(self),
+        };
+        Ok(Scope::Meant { kind, name, drives })
     }
 
     /// The drives to stop, bus by bus.
@@ -115,6 +127,10 @@ impl Scope {
                 let groups = plant.drives().filter_map(|drive| drive.image.spec.group.clone());
                 Err(unknown("group", name, groups))
             }
+            (Scope::Meant { kind, name, .. }, _, true) => {
+                let names = plant.drives().map(|drive| drive.image.spec.name.clone());
+                Err(unknown(kind, name, names))
+            }
             (_, _, true) => Err(NothingToStop::NotControlled),
             _ => Ok(drives),
         }
@@ -127,8 +143,28 @@ impl Scope {
             Scope::Bus(name) => spec.bus == *name,
             Scope::Buses(names) => names.contains(&spec.bus),
             Scope::Group(name) => spec.group.as_ref() == Some(name),
-            Scope::Machines(machines) => machines.contains(&drive.machine()),
+            Scope::Meant { drives, .. } => drives.iter().any(|(machine, _)| *machine == drive.machine()),
         }
+    }
+
+    /// The drives that were meant when the request began and that no stop reaches any more, each with the reason.
+    pub(super) fn lost(&self, plant: &Plant) -> Vec<(Machine, String, Refusal)> {
+        let Scope::Meant { drives, .. } = self else {
+            return Vec::new();
+        };
+        let why = |machine: &Machine| match plant.drive_at(machine) {
+            Some(drive) if drive.image.spec.access == Access::Control => None,
+            Some(_) => Some(Refusal::NotAllowed(
+                "a reload took its access = \"control\" away while the request arrived".to_string(),
+            )),
+            None => Some(Refusal::UnknownDrive(
+                "a reload removed the drive while the request arrived".to_string(),
+            )),
+        };
+        let lost = drives
+            .iter()
+            .filter_map(|(machine, name)| Some((machine.clone(), name.clone(), why(machine)?)));
+        lost.collect()
     }
 }
 

@@ -163,3 +163,69 @@ fn orders_without_end_are_all_answered() {
     let left = orders.iter_mut().filter_map(|order| order.report.try_recv().ok());
     assert_eq!(left.count(), MOST_ORDERS);
 }
+
+/// The plant behind a reload that left only these of its drives, monitored ones with `false`.
+fn reloaded(left: &[(&str, u8, bool)]) -> Plant {
+    let profile = nx();
+    let bus = |name: &str| {
+        let of_bus = left.iter().filter(|(bus, ..)| *bus == name);
+        let drive = |(_, address, control): &(&str, u8, bool)| {
+            image(DriveSpec {
+                access: if *control { Access::Control } else { Access::Monitor },
+                ..monitored(&format!("new-{name}{address}"), name, *address, &profile)
+            })
+        };
+        up(bus(bus_spec(name), of_bus.map(drive).collect()))
+    };
+    Plant::new("g", STALE_AFTER, vec![bus("a"), bus("b")])
+}
+
+#[test]
+fn a_drive_that_the_name_meant_and_that_is_out_of_reach_is_not_proven_to_stand() {
+    let (origin, now) = (Origin::new(SourceKind::Http, "alice"), Instant::now());
+    let earlier = NamedDrives::of(&plant());
+    let of_then = |scope: Scope| scope.as_of(&earlier).unwrap();
+    let group = || of_then(Scope::Group("pumps".to_string()));
+    let (removed, monitored) = ("a reload removed the drive", "access = \"control\" away");
+    for (left, lost, code) in [
+        (&[("a", 1, true)][..], removed, "unknown_drive"),
+        (&[("a", 1, true), ("b", 1, false)], monitored, "not_allowed"),
+        (&[("a", 1, true), ("b", 2, true)], removed, "unknown_drive"),
+    ] {
+        let (plant, all) = (reloaded(left), StopAll::default());
+        let mut order = all.order(&plant, &group(), &origin, WAIT, now).unwrap();
+        assert_eq!(waiting(&plant), [1, 0], "{left:?}");
+        let stop = crate::testkit::take_next(&plant.buses[0].queue, now).unwrap();
+        stop.answer(
+            &crate::order::Outcome::Acknowledged(drivegate_proto::Reply::Written),
+            now,
+        );
+        let later = now + Duration::from_millis(50);
+        crate::testkit::read(&plant.buses[0].image.drives[0], 2100, &[1, 0, 0, 0], later);
+        assert!(all.advance(&plant, later), "{left:?}: it waits for the other");
+        all.advance(&plant, now + WAIT);
+        let report = order.report.try_recv().unwrap();
+        assert!(!report.ok && report.drives.len() == 2, "{report:?}");
+        assert_eq!(report.drives[0].drive, "new-a1");
+        assert_eq!(
+            (&*report.drives[1].drive, report.drives[1].outcome),
+            ("b1", Stopped::Unproven)
+        );
+        let why = report.drives[1].reason.as_deref();
+        assert!(why.is_some_and(|why| why.contains(lost)), "{report:?}");
+        let audit = plant.command_log.audit().recent(None);
+        let has_lost = audit.iter().any(|line| line.contains("\"b1\"") && line.contains(code));
+        assert!(has_lost, "{audit:?}");
+    }
+    for (scope, left) in [
+        (group(), &[][..]),
+        (group(), &[("a", 1, false), ("b", 2, true)]),
+        (of_then(Scope::Bus("a".to_string())), &[("b", 1, true)]),
+    ] {
+        let (plant, all) = (reloaded(left), StopAll::default());
+        let error = all.order(&plant, &scope, &origin, WAIT, now).unwrap_err();
+        assert!(matches!(error, NothingToStop::Unknown { .. }), "{error}");
+        assert!(error.to_string().contains("no controlled drive left of the"), "{error}");
+        assert_eq!(waiting(&plant), [0, 0]);
+    }
+}
