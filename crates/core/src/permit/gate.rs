@@ -134,6 +134,24 @@ impl Gate {
         verdict
     }
 
+    /// Whether every rule would let a command be accepted. Nothing is noted: the command is not accepted for another reason.
+    pub(crate) fn would_accept(&self, command: &Command, facts: &dyn Facts, now: Instant) -> bool {
+        let nothing_known = DriveGate::default();
+        command.reach().all(|drive| {
+            let seen = facts.seen(drive);
+            let ask = Ask {
+                stage: Stage::Accept,
+                now,
+                drive,
+                intent: &command.intent,
+                origin: command.ticket.origin(),
+                seen: seen.as_ref(),
+            };
+            let known = self.drives.get(&drive).unwrap_or(&nothing_known);
+            !matches!(judge::judge(&ask, known, self), Verdict::Refuse(_))
+        })
+    }
+
     /// Judges an order for one drive. A refusal is recorded where that matters.
     pub fn ask(&mut self, ask: &Ask<'_>) -> Verdict {
         let nothing_known = DriveGate::default();

@@ -23,21 +23,30 @@ impl Pending {
     /// Ends an order that is not sent. Where a pause of the process was the cause, the order still renews the lease of
     /// its client.
     pub(super) fn end_unwanted(&mut self, command: Command, outcome: &Outcome, now: Instant) {
-        let (arrival, origin) = (&command.intent.window.arrival, command.ticket.origin());
+        let arrival = &command.intent.window.arrival;
         let waited = self.gate.paused().is_some_and(|pause| arrival.asked < pause.ended);
         let by_pause = waited || arrival.stall.is_some() || arrival.pause.is_some();
         let unwanted = matches!(outcome, Outcome::Expired | Outcome::Purged);
-        if by_pause && unwanted && command.urgency() != Urgency::Read && origin.kind.is_client() {
-            for drive in command.reach() {
-                if self.gate.hold_renews(drive, origin) && !self.renewed.contains(&drive) {
-                    self.renewed.push(drive);
-                }
-            }
+        if by_pause && unwanted {
+            self.renew_by(&command);
         }
         command.answer(outcome, now);
     }
 
-    /// Whether an order that a pause kept from this drive renews its lease, once.
+    /// Renews the leases by an order that the gateway itself keeps from its drives: its client is there.
+    pub(super) fn renew_by(&mut self, command: &Command) {
+        let origin = command.ticket.origin();
+        if command.urgency() == Urgency::Read || !origin.kind.is_client() {
+            return;
+        }
+        for drive in command.reach() {
+            if self.gate.hold_renews(drive, origin) && !self.renewed.contains(&drive) {
+                self.renewed.push(drive);
+            }
+        }
+    }
+
+    /// Whether an order that a pause or a reload kept from this drive renews its lease, once.
     pub fn take_renewed(&mut self, drive: DriveIndex) -> bool {
         let place = self.renewed.iter().position(|renewed| *renewed == drive);
         place.is_some_and(|place| self.renewed.swap_remove(place) == drive)

@@ -88,6 +88,10 @@ impl CommandQueue {
         let outcome = Outcome::ShuttingDown;
         self.background().close(&outcome, now);
         let mut pending = self.lock();
+        let waiting = std::mem::take(&mut pending.waiting);
+        let kept_away = waiting.iter().filter(|c| !c.is_stop());
+        kept_away.for_each(|command| pending.renew_by(command));
+        pending.waiting = waiting;
         pending.remove(now, &outcome, |c| !c.is_stop());
         pending.closed = Some(outcome);
         pending.ending = true;

@@ -60,7 +60,7 @@ pub struct Pending {
     stopping: Option<Stopping>,
     /// Commands that were refused when their turn came, and are not reported yet.
     denied: VecDeque<Denied>,
-    /// Drives whose leases are renewed by orders that a pause kept from them, once each.
+    /// Drives whose leases are renewed by orders that a pause or a reload kept from them, once each.
     renewed: Vec<DriveIndex>,
 }
 
@@ -131,6 +131,10 @@ impl Pending {
         }
         let waits = self.ending && is_stop;
         if let Some(outcome) = self.closed.clone().filter(|_| !waits) {
+            // The last stops of a reload may take longer than a lease.
+            if self.ending && self.gate.would_accept(&command, facts, now) {
+                self.renew_by(&command);
+            }
             command.answer(&outcome, now);
             return None;
         }

@@ -3,6 +3,7 @@
 
 use super::*;
 use crate::order::{Effect, Effects, Intent, PassedOn, Target};
+use crate::permit::DrillLock;
 use drivegate_model::drive::{DriveIndex, PointIndex};
 use drivegate_proto::{Reply, RequestPdu};
 
@@ -212,6 +213,54 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
     for answer in [&mut waits, &mut late, &mut last] {
         assert!(outcome(answer).is_some_and(|outcome| outcome.is_ok()));
     }
+}
+
+/// The lease of a drive may be shorter than the wait for the last stops of its bus.
+#[test]
+fn an_order_that_a_handover_keeps_from_its_drive_renews_the_lease() {
+    let (stats, now): (Arc<CommandLog>, _) = (Arc::default(), Instant::now());
+    let queue = CommandQueue::new().unwrap();
+    let give = |kind: SourceKind, drive: usize, urgency| {
+        let origin = Origin::new(kind, "a");
+        let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, now, stats.clone());
+        let admitted = Admitted {
+            order: points(&[1]),
+            urgency,
+            reference_only: false,
+            ranges: Vec::new(),
+        };
+        queue.submit(command(drive, admitted, now, ticket), &(), now);
+        receiver
+    };
+    let renewed = |drive: usize| queue.lock().take_renewed(DriveIndex::new(drive));
+    let mut waits = give(SourceKind::Mqtt, 1, Urgency::Command);
+    let _stop = give(SourceKind::Mqtt, 3, Urgency::Stop);
+    assert!(!renewed(1));
+    queue.begin_handover(vec![DriveIndex::new(3)], now);
+    assert_eq!(outcome(&mut waits), Some(Outcome::ShuttingDown));
+    assert!(renewed(1) && queue.has_last_stops());
+    let drill = DrillLock {
+        who: "d".to_string(),
+        quiet_until: None,
+    };
+    queue.set_drill(DriveIndex::new(4), Some(drill));
+    for (kind, drive, urgency, renews) in [
+        (SourceKind::ModbusTcp, 2, Urgency::Command, true),
+        (SourceKind::ModbusTcp, 2, Urgency::Read, false),
+        (SourceKind::Schedule, 2, Urgency::Command, false),
+        // An order that the gate would refuse.
+        (SourceKind::ModbusTcp, 4, Urgency::Command, false),
+    ] {
+        let mut refused = give(kind, drive, urgency);
+        let what = format!("{kind:?}, drive {drive}, {urgency:?}");
+        assert_eq!(outcome(&mut refused), Some(Outcome::ShuttingDown), "{what}");
+        assert_eq!(renewed(drive), renews, "{what}");
+        assert!(!renewed(drive), "{what}: once");
+    }
+    assert!(!renewed(2) && !renewed(3), "a silent client's lease ends");
+    queue.close(Outcome::ShuttingDown, now);
+    let _late = give(SourceKind::ModbusTcp, 2, Urgency::Command);
+    assert!(!renewed(2), "the bus has ended");
 }
 
 /// A client whose handle is idle keeps only the first queue: the last queue gets its stop, and the queues between are
