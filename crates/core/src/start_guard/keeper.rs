@@ -1,7 +1,7 @@
 //! The thread that saves starts in the state directory. A start waits for it, a stop never does.
 
 use std::fs::{File, OpenOptions, TryLockError};
-use std::io;
+use std::io::{self, ErrorKind};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
@@ -94,9 +94,19 @@ fn lock(place: &Path, guards: &Guards, taken: WhileTaken, end: &Receiver<()>) ->
 /// Opens the file of the lock, which is created for the first one.
 fn open(place: &Path) -> io::Result<File> {
     files::create_dir(place.parent().unwrap_or(place))?;
-    let file = OpenOptions::new().read(true).append(true).create(true).open(place)?;
+    let create = || OpenOptions::new().read(true).append(true).create(true).open(place);
+    let file = or_read_only(create(), place)?;
     files::give_to_owner(&file, place);
     Ok(file)
+}
+
+/// Opens a file that may not be written for reading, which a lock can do with: a command of root leaves it to root where
+/// the system does not let root give files away.
+fn or_read_only(opened: io::Result<File>, place: &Path) -> io::Result<File> {
+    match opened {
+        Err(error) if error.kind() == ErrorKind::PermissionDenied => File::open(place).map_err(|_| error),
+        opened => opened,
+    }
 }
 
 fn run(path: &Path, guards: &Guards, end: &Receiver<()>) {
@@ -116,5 +126,32 @@ fn run(path: &Path, guards: &Guards, end: &Receiver<()>) {
         if ends {
             return;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_that_may_only_be_read_is_locked_all_the_same() {
+        let dir = tempfile::tempdir().unwrap();
+        let place = dir.path().join(STARTS_LOCK);
+        let denied = || Err(io::Error::from(ErrorKind::PermissionDenied));
+        let missing = or_read_only(denied(), &place).unwrap_err();
+        assert_eq!(
+            missing.kind(),
+            ErrorKind::PermissionDenied,
+            "the reason of the first attempt"
+        );
+        let of_root = open(&place).unwrap();
+        let of_service = or_read_only(denied(), &place).unwrap();
+        of_root.try_lock().unwrap();
+        assert!(matches!(of_service.try_lock(), Err(TryLockError::WouldBlock)));
+        of_root.unlock().unwrap();
+        of_service.try_lock().unwrap();
+        assert!(matches!(of_root.try_lock(), Err(TryLockError::WouldBlock)));
+        let full = or_read_only(Err(io::Error::from(ErrorKind::StorageFull)), &place);
+        assert_eq!(full.unwrap_err().kind(), ErrorKind::StorageFull);
     }
 }
