@@ -36,7 +36,7 @@ pub use judge::{Ask, DriveFacts, Facts, Stage, Verdict};
 pub use priorities::{Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, VoidSlot};
 pub use reference_limits::{LastWritten, is_reference, limits_passed};
 pub use rules::access::{access, client_access, right_lost};
-pub use rules::machine::refusal as meant_another;
+pub use rules::machine::{out_of_reach, refusal as meant_another};
 pub use rules::standing::{
     AT_NEXT_START, Form, KnownRun, Motor, OnRunning, Repeats, Wants, not_seen, parameter, running_unknown,
 };

@@ -1,6 +1,7 @@
 //! The drives that a command to stop all includes.
 
 use crate::order::Refusal;
+use crate::permit::out_of_reach;
 use crate::plant::{DriveHandle, Plant};
 use crate::process_image::{Access, Machine};
 
@@ -154,12 +155,7 @@ impl Scope {
         };
         let why = |machine: &Machine| match plant.drive_at(machine) {
             Some(drive) if drive.image.spec.access == Access::Control => None,
-            Some(_) => Some(Refusal::NotAllowed(
-                "a reload took its access = \"control\" away while the request arrived".to_string(),
-            )),
-            None => Some(Refusal::UnknownDrive(
-                "a reload removed the drive while the request arrived".to_string(),
-            )),
+            reached => Some(out_of_reach(reached.is_none())),
         };
         let lost = drives
             .iter()

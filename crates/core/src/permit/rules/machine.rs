@@ -13,6 +13,16 @@ pub fn refusal() -> Refusal {
     )
 }
 
+/// The refusal of a stop of several drives for one of them that a reload took out of reach while the request arrived:
+/// removed, or no longer controlled.
+pub fn out_of_reach(is_removed: bool) -> Refusal {
+    if is_removed {
+        Refusal::UnknownDrive("a reload removed the drive while the request arrived".to_string())
+    } else {
+        Refusal::NotAllowed("a reload took its access = \"control\" away while the request arrived".to_string())
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::time::{Duration, Instant};
