@@ -150,16 +150,12 @@ impl Target {
     /// # Errors
     /// If there is no reply; contains the reason as a message.
     pub(super) fn ask(&self, asked: &GatewayRequest, needs: Needs<'_>) -> Result<(Reply, RequestRoute), String> {
-        let runtime = super::runtime()?;
-        let answer = runtime.block_on(async {
+        super::without_waiting_for_threads(async {
             let (conversation, reply) = Conversation::begin(self, asked, needs).await?;
             let way = conversation.way();
             conversation.end().await;
             Ok((reply, way))
-        });
-        // A disk that hangs still has a thread; the reply is shown all the same.
-        runtime.shutdown_background();
-        answer
+        })
     }
 }
 

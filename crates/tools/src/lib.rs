@@ -207,6 +207,14 @@ fn runtime() -> Result<tokio::runtime::Runtime, String> {
     built.map_err(cannot_start)
 }
 
+/// Runs `work` on a runtime of its own. A disk that hangs still has a thread then; the result is known all the same.
+fn without_waiting_for_threads<T>(work: impl Future<Output = Result<T, String>>) -> Result<T, String> {
+    let runtime = runtime()?;
+    let done = runtime.block_on(work);
+    runtime.shutdown_background();
+    done
+}
+
 /// Runs `command` on a new runtime.
 fn block_on(command: impl Future<Output = Outcome>) -> Outcome {
     let runtime = drivegate_north::reading::watched_runtime();
@@ -236,5 +244,33 @@ fn add_profiles(profiles: &mut Profiles, dirs: &[PathBuf]) -> Result<(), Failure
         Ok(())
     } else {
         Err(Failure::Invalid(problems))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc::channel;
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn a_result_waits_for_no_thread_that_hangs() {
+        let ((free, hangs), (tell, told)) = (channel::<()>(), channel());
+        let command = std::thread::spawn(move || {
+            let done = without_waiting_for_threads(async {
+                let (begun, began) = tokio::sync::oneshot::channel();
+                drop(tokio::task::spawn_blocking(move || {
+                    let _ = begun.send(());
+                    hangs.recv()
+                }));
+                began.await.map_err(|_| "not begun".to_string())
+            });
+            tell.send(done)
+        });
+        let done = told.recv_timeout(Duration::from_secs(30));
+        drop(free);
+        command.join().unwrap().unwrap();
+        assert_eq!(done, Ok(Ok(())));
     }
 }

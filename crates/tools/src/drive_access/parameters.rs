@@ -20,7 +20,7 @@ impl Target {
         how: ReadParameters,
         progress: impl FnMut(&ParameterReading),
     ) -> Result<String, String> {
-        crate::runtime()?.block_on(self.read_all(how, progress))
+        crate::without_waiting_for_threads(self.read_all(how, progress))
     }
 
     async fn read_all(
@@ -67,7 +67,7 @@ impl Target {
         agreed: impl FnMut(&Restore) -> bool,
         progress: impl FnMut(&Restore),
     ) -> Result<Restore, String> {
-        crate::runtime()?.block_on(self.restore_all(act, agreed, progress))
+        crate::without_waiting_for_threads(self.restore_all(act, agreed, progress))
     }
 
     async fn restore_all(
