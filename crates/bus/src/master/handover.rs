@@ -66,7 +66,10 @@ impl Master {
             shutdown.end(&self.bus);
         }
         let mut queue = self.bus.queue.lock();
-        for drive in &mut self.drives {
+        for (index, drive) in self.drives.enumerate_mut() {
+            if queue.take_renewed(index) {
+                drive.supervision.renew(now);
+            }
             if queue.is_ending()
                 && let Some(stop) = drive.take_stop(now)
                 && let Err(stop) = queue.give_back(stop)

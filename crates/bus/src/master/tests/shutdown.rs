@@ -92,3 +92,16 @@ fn a_drive_that_fell_silent_with_the_shutdown_keeps_no_stop_from_those_that_are_
     assert!(missing.starts_with("`d1` did not acknowledge its stop"), "{missing}");
     assert!(!rig.runs(1));
 }
+
+/// A reload refuses an order in the last moment of a bus: its client is there, so the lease begins anew with the next bus.
+#[test]
+fn an_order_that_a_reload_refuses_renews_the_lease_that_is_handed_over() {
+    let mut rig = Rig::new(1);
+    rig.switch(0, "client", true);
+    rig.run(Duration::from_millis(300));
+    rig.bus.queue.begin_handover(Vec::new(), rig.now);
+    let mut refused = rig.order(0, "client", ModelPoint::SpeedReference, Value::Number(40.0));
+    assert_eq!(outcome(&mut refused), Some(Outcome::ShuttingDown));
+    let handover = rig.master.ended(None, rig.now);
+    assert_eq!(handover.leases[0].lease, Lease::held(rig.now));
+}
