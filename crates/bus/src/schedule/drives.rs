@@ -41,6 +41,8 @@ pub(crate) const TRIAL_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Du
 const SOUND_FOR: Duration = Duration::from_secs(10);
 /// Pause before a slow request is tried again that the drive was too busy for.
 const BUSY_PAUSE: Duration = Duration::from_secs(1);
+/// Replies in a row that the drive is busy, after which nothing waits for the read any more.
+const MOST_BUSY: u32 = 3;
 
 #[derive(Debug, Clone)]
 pub(super) struct Item {
@@ -56,6 +58,8 @@ pub(super) struct Item {
     pub(super) never_answers: bool,
     /// Number of consecutive refusals.
     pub(super) refusals: u32,
+    /// Number of consecutive replies by which the drive is busy, or fails.
+    pub(super) busy: u32,
     pub(super) failures: u32,
     /// Time of the last failed poll of this item.
     pub(super) failed_at: Option<Instant>,
@@ -195,6 +199,7 @@ impl Item {
             refused: false,
             never_answers: false,
             refusals: 0,
+            busy: 0,
             failures: 0,
             failed_at: None,
             is_pending: read.class != PollClass::Fault,
@@ -328,10 +333,11 @@ impl DriveSchedule {
         self.presence == Presence::Online && self.items.iter().any(unread)
     }
 
-    /// Whether a read that the drive neither refuses nor leaves unanswered was not answered since the drive came online.
+    /// Whether a read that the drive neither refuses, nor leaves unanswered, nor is too busy for each time was not answered since the drive came online.
     pub(super) fn awaits(&self, covers: impl Fn(&PlannedRead) -> bool) -> bool {
         let is_read = |class: PollClass| matches!(class, PollClass::Fast | PollClass::Slow | PollClass::Once);
-        let is_sound = |item: &Item| !item.refused && !item.never_answers && item.failures == 0;
+        let is_sound =
+            |item: &Item| !item.refused && !item.never_answers && item.failures == 0 && item.busy < MOST_BUSY;
         let awaited = |item: &&Item| !item.is_answered && is_sound(item) && is_read(item.read.class);
         self.presence == Presence::Online && self.items.iter().filter(awaited).any(|item| covers(&item.read))
     }
@@ -468,6 +474,7 @@ impl DriveSchedule {
         if !addressed {
             // The drive is busy or reports a failure: it is online, its values become older, and the poll is
             // repeated in turn.
+            item.busy = item.busy.saturating_add(1);
             item.due = match item.read.class {
                 PollClass::Fast => item.due.max(now),
                 _ => now + BUSY_PAUSE,

@@ -48,7 +48,7 @@ impl Schedule {
             item.failures = 0;
             item.unread = false;
             item.is_answered = true;
-            item.refusals = 0;
+            (item.refusals, item.busy) = (0, 0);
             let was_in_vain = [&mut item.refused, &mut item.never_answers].map(std::mem::take);
             if was_in_vain.contains(&true) {
                 // The bad point is readable again, so it is read together with its neighbours.

@@ -115,7 +115,10 @@ impl Leases {
                 drive: drive.name.clone(),
             };
             let machine = bus.spec.machine(drive);
-            self.parted.remove(&machine);
+            // The lease of a drive that is not supervised now still waits for a reload that supervises it again.
+            if drive.supervision.is_some() {
+                self.parted.remove(&machine);
+            }
             self.left.insert(machine, left);
         }
     }
@@ -133,8 +136,9 @@ impl Leases {
             if drive.supervision.is_none() {
                 let kept = left.as_ref().map(|left| (left.carried.stops, left.carried.direction));
                 // The time of the lease does not run until a configuration supervises the drive again.
-                self.parted
-                    .extend(left.map(|left| (machine, (now, left.carried.alone()))));
+                if let Some(left) = left {
+                    self.parted.entry(machine).or_insert((now, left.carried.alone()));
+                }
                 return kept.map(|(stops, direction)| CarriedState {
                     stops,
                     direction,
@@ -150,7 +154,14 @@ impl Leases {
                 }
             });
             let back = |(at, carried): (Instant, CarriedState)| carried.after(now.saturating_duration_since(at));
-            left.or_else(|| self.parted.remove(&machine).map(back))
+            match (left, self.parted.remove(&machine).map(back)) {
+                // The drive was not supervised meanwhile.
+                (Some(left), Some(parted)) => Some(CarriedState {
+                    lease: parted.lease,
+                    ..left
+                }),
+                (left, parted) => left.or(parted),
+            }
         };
         bus.drives
             .iter()

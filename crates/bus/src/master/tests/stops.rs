@@ -403,6 +403,28 @@ fn a_run_command_waits_until_the_direction_of_the_motor_is_read() {
     }
 }
 
+/// A drive that is too busy for every read does not keep a run command waiting until its time is over.
+#[test]
+fn a_run_command_does_not_wait_for_a_drive_that_is_always_busy() {
+    for family in ["danfoss-fc", "weg-cfw", "fuji-frenic"] {
+        let mut rig = Rig::empty(1, family, Protocol::ModbusRtu, Duration::from_millis(10), |spec| {
+            DriveSpec {
+                supervision: None,
+                ..spec
+            }
+        });
+        rig.drives[0].family = Some(FamilyDrive::new(&drivegate_testkit::profile(family)));
+        rig.drives[0].to_reads = Some(Exception::BUSY);
+        while !matches!(rig.bus.image.drives[0].snapshot().link, Link::Online(_)) {
+            rig.step();
+        }
+        let mut run = rig.switch(0, "a", true);
+        rig.run(DEFAULT_EXPIRY - Duration::from_millis(100));
+        let outcome = outcome(&mut run);
+        assert!(outcome.as_ref().is_some_and(Outcome::is_ok), "{family}: {outcome:?}");
+    }
+}
+
 /// A direction that waits for the next start, because the drive has no word for it at standstill, waits behind a reload too.
 #[test]
 fn a_direction_for_the_next_start_outlives_a_reload() {

@@ -97,6 +97,14 @@ fn over(buses: &[&BusSettings], pause: Duration) -> Option<Duration> {
         let (mut leases, _) = parted.recall(now);
         leases.left(pair[0], held);
         held = leases.of(pair[1], now);
+        // The drive has a direction, whether or not it is supervised.
+        let drives = pair[1].drives.iter().zip(&mut held);
+        for (_, carried) in drives.filter(|(drive, _)| drive.supervision.is_none()) {
+            carried.direction = Some(OrderedDirection {
+                reverse: true,
+                at_next_start: false,
+            });
+        }
         parted.keep(&leases, &[], now);
     }
     let place = buses[buses.len() - 1]
@@ -105,7 +113,7 @@ fn over(buses: &[&BusSettings], pause: Duration) -> Option<Duration> {
         .position(|drive| drive.name == "pump-1")?;
     (0..600)
         .map(Duration::from_secs)
-        .find(|ago| now.checked_sub(*ago).map(self::held) == Some(held[place]))
+        .find(|ago| now.checked_sub(*ago).map(Lease::held) == Some(held[place].lease))
 }
 
 #[test]
